@@ -16,7 +16,7 @@ from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, DONE_KEY, REWARD_KEY
 from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY
 from vla_eval.models.shared.stages import EPISODE_STEPS
-from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
+from vla_eval.testing.process_memory import peak_device_bytes, reset_device_peak
 from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, write_checkpoint
 from vla_eval.training.batches import preprocessed
 from vla_eval.training.cost.estimate import estimate

@@ -21,7 +21,7 @@ from vla_eval.models.openvla.weight_names import (
     TOP,
     _replaced,
 )
-from vla_eval.models.spatialvla.weight_names import BEGINNINGS, _renamed
+from vla_eval.models.spatialvla.conversion import BEGINNINGS, _renamed
 
 
 def openvla_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:

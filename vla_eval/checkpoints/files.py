@@ -47,15 +47,12 @@ class TrainingFacts:
     """What a policy saw in training, kept beside its weights and compared before an evaluation.
 
     Attributes:
-        run: name of the fine-tuning run.
         dataset, dataset_sha256: which demonstrations; the digest names their content.
         task: the task of the demonstrations; empty if they are of several, or of none that is known.
         state: which proprioception `observation.state` was: `eef` or `joints`.
         images: image fields of the dataset, in the policy's order -> (height_px, width_px).
         fps: control steps per second.
-        action_names: dimensions of the action.
         control_mode: what an action means.
-        run_seed: seed of the training run.
         seeds: task -> the seeds whose demonstrations these are; None if not known: another program's seed is
             another episode, and earlier versions did not note them.
         tasks: all tasks of the demonstrations; empty where they are not known.
@@ -153,8 +150,10 @@ def checkpoint_sha256(path: Path) -> str:
     below: str | None = None
     for part in reversed([folder, *adapter_bases(folder)]):
         digest = hashlib.sha256()
-        for name, file in _hashed_files(part):
-            digest.update(f"{name}\0{file_sha256(file)}\n".encode())
+        for file in sorted(part.rglob("*")):
+            name = file.relative_to(part).as_posix()
+            if file.is_file() and name not in NOT_HASHED:
+                digest.update(f"{name}\0{file_sha256(file)}\n".encode())
         if below is not None:
             digest.update(f"base\0{below}\n".encode())
         below = digest.hexdigest()
@@ -212,13 +211,6 @@ def read_facts(folder: Path) -> TrainingFacts | None:
         return decode(TrainingFacts, data, where=str(path))
     except RecipeError as exc:
         raise CheckpointError(f"{exc} The file was changed; fetch the checkpoint again.") from exc
-
-
-def _hashed_files(folder: Path) -> Iterator[tuple[str, Path]]:
-    for file in sorted(folder.rglob("*")):
-        name = file.relative_to(folder).as_posix()
-        if file.is_file() and name not in NOT_HASHED:
-            yield name, file
 
 
 def unreadable(file: Path, exc: Exception) -> CheckpointError:

@@ -22,7 +22,7 @@ from lerobot.processor.converters import batch_to_transition, transition_to_batc
 from safetensors.torch import load
 
 from vla_eval.checkpoints.files import unreadable
-from vla_eval.checkpoints.saved_processor import SavedProcessor, SavedStep, check_paths, read_saved_processor
+from vla_eval.checkpoints.saved_processor import SavedStep, check_paths, read_saved_processor
 from vla_eval.errors import CheckpointError
 from vla_eval.strict.json_fields import FETCH_AGAIN
 
@@ -75,7 +75,12 @@ def load_processor(
     """
     saved = read_saved_processor(path)
     classes = [resolve_step(step) for step in saved.steps]  # all of them, before the first is called
-    _check_overrides(saved, overrides)
+    for name in overrides:
+        if name not in saved.names():
+            raise CheckpointError(
+                f"{saved.path}: expected a step '{name}', found {', '.join(saved.names()) or 'none'}. "
+                f"{FETCH_AGAIN}"
+            )
     for step in saved.steps:
         own = overrides.get(step.name, {})
         kept = {key: value for key, value in step.config.items() if key not in own}
@@ -163,15 +168,6 @@ def _refused(step: SavedStep, why: str) -> CheckpointError:
         "is registered, or one of lerobot's or of an installed plugin's (`lerobot_policy_…`) processor "
         "modules. If it is yours, register it with ProcessorStepRegistry (docs/security.md)."
     )
-
-
-def _check_overrides(saved: SavedProcessor, overrides: Overrides) -> None:
-    for name in overrides:
-        if name not in saved.names():
-            raise CheckpointError(
-                f"{saved.path}: expected a step '{name}', found {', '.join(saved.names()) or 'none'}. "
-                f"{FETCH_AGAIN}"
-            )
 
 
 def _state(step: SavedStep) -> dict[str, Any] | None:

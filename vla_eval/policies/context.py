@@ -10,8 +10,12 @@ from vla_eval.specs import EnvSpec
 class PolicyContext:
     """The first argument of every policy factory; the recipe's `args` follow as keyword arguments.
 
-    A scripted policy plans chunks of `chunking.min_chunk_size`; a task without candidates has 0; slots are
-    0 … n_slots - 1.
+    Attributes:
+        name: the policy's name in records and tables.
+        env: what the environment offers.
+        chunking: how its chunks will be executed; a scripted policy plans `min_chunk_size` actions.
+        n_candidates: how many candidates the task has; 0 for a task without candidates.
+        n_slots: how many episodes will run side by side, in slots 0 … n_slots - 1.
     """
 
     name: str

@@ -36,9 +36,15 @@ def bare_policy(name: str) -> str:
 def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
     """Return the recipe of a policy, or one for the checkpoint in a folder or for the server at an address.
 
-    `name`: of a recipe, its file, or a folder with a LeRobot checkpoint, whose digest is then the recipe's;
-    or the address of a policy server, `ws://HOST:PORT`, with commas if there are several, maybe after
-    `RECIPE@`.
+    Args:
+        name: the name of a recipe, its file, or a folder: a fine-tuning run, a checkpoint in it, or a
+            LeRobot checkpoint. The recipe's digest is then that of the checkpoint's files. Or the address of
+            a policy server, `ws://HOST:PORT`, with commas if there are several, maybe after `RECIPE@`.
+
+    Raises:
+        UnknownNameError, RecipeError: see `load_recipe`.
+        CheckpointError: it is a folder without a checkpoint.
+        RemotePolicyError: it is an address, and there is no policy server.
     """
     server = named_server(name)
     if server is not None and server.recipe is None:

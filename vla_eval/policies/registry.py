@@ -84,7 +84,15 @@ def own_modules(adapters: Iterable[str]) -> tuple[str, ...]:
 
 
 def policy_factory(adapter: str) -> PolicyFactory:
-    """Return the function that makes policies of an adapter: a name from the registry, or `module:attr`."""
+    """Return the function that makes policies of this adapter.
+
+    Args:
+        adapter: a name from the registry, or `module:attr`.
+
+    Raises:
+        UnknownNameError: there is no such adapter, module or attribute.
+        MissingDependencyError: the adapter's module needs a package that is not installed.
+    """
     module_name, attribute = _target(adapter)
     if not module_name.startswith(_OWN_ADAPTERS):
         let_everything(f"{adapter} is a policy of the user's own")

@@ -15,11 +15,16 @@ SLOT = 0
 def check_env(make: Callable[[], SimEnv], *, n_steps: int = 8, renders: bool = True) -> None:
     """Raise `ConformanceError` unless the environments that `make` returns fulfil the contract.
 
-    `make` returns a new environment of the same settings at each call; images are checked if it `renders`.
+    Args:
+        make: returns a new environment of the same settings at each call.
+        n_steps: number of control steps of the check's episodes.
+        renders: whether the environment can render images; otherwise images are not checked.
     """
     env = make()
     try:
-        actions = _actions(env.spec, n_steps)
+        action = env.spec.action
+        drawn = np.random.default_rng(0).uniform(action.low, action.high, (n_steps, len(action.dims)))
+        actions = drawn.astype(np.float32)
         first = _episode(env, 1, actions, every=1 if renders else None)
         for result in first:
             _check_observation(result.observation, env.spec, with_images=renders)
@@ -43,13 +48,6 @@ def check_env(make: Callable[[], SimEnv], *, n_steps: int = 8, renders: bool = T
             fresh.close()
     finally:
         env.close()
-
-
-def _actions(spec: EnvSpec, n_steps: int) -> FloatArray:
-    drawn = np.random.default_rng(0).uniform(
-        spec.action.low, spec.action.high, (n_steps, len(spec.action.dims))
-    )
-    return drawn.astype(np.float32)
 
 
 def _episode(env: SimEnv, seed: int, actions: FloatArray, *, every: int | None) -> list[StepResult]:

@@ -61,7 +61,8 @@ def check_policy(
     check_compatible(policy.spec, env)
     runs = _Runs(policy.spec, env, observe, instruction)
     met = _Requirements(report)
-    met.note(f"{env.task} provides what it reads: {_inputs(policy.spec)}.")
+    reads = ", ".join((*policy.spec.cameras, *policy.spec.states)) or "nothing"
+    met.note(f"{env.task} provides what it reads: {reads}.")
     alone = [runs.run(policy, _Episode(slot=slot, seed=seed))[0] for slot, seed in enumerate((2, 1))]
     met.note(f"A chunk is float32 of shape {runs.chunk_shape} and finite.")
     met.note("It leaves the observations as they are.")
@@ -109,10 +110,6 @@ class _Requirements:
             equal = all(np.array_equal(a.actions, b.actions) for a, b in pairs)
             claim(equal, f"{SAME} {where}.", advice=advice)
         self.note(f"{SAME} {where}.")
-
-
-def _inputs(spec: PolicySpec) -> str:
-    return ", ".join((*spec.cameras, *spec.states)) or "nothing"
 
 
 class _Runs:

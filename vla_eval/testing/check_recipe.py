@@ -9,10 +9,9 @@ from dataclasses import replace
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.core import Observation, Policy
+from vla_eval.core import Observation
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
-from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.evaluation.worker import EnvFacts, make_policy
@@ -57,15 +56,11 @@ def check_recipe(
         instruction=group.instruction,
         report=report,
     )
-    _say_what_is_read(first, group, say)
-    return met
-
-
-def _say_what_is_read(policy: Policy, group: EpisodeGroup, say: Callable[[str], None]) -> None:
     watch = SentenceWatch(group.part)
-    for reading in policy.readings.values() if isinstance(policy, ReadingPolicy) else ():
+    for reading in first.readings.values() if isinstance(first, ReadingPolicy) else ():
         for line in watch.lines(reading, group.key.task):
             say(f"warning: {line}")
+    return met
 
 
 class _Shown:

@@ -14,9 +14,19 @@ def check_remote(
     timeout_seconds: float = 60.0,
     report: Callable[[str], None] = lambda requirement: None,
 ) -> list[str]:
-    """Check a server as `vla_eval.wire.check.check_remote` does; return the requirements that are met.
+    """Check a server as `vla_eval.wire.check.check_remote` does.
 
-    `report` is called with each of them as soon as it is known.
+    Args:
+        url: `ws://HOST:PORT`.
+        api_key: the server's key, if it wants one.
+        timeout_seconds: how long a reply may take.
+        report: called with each requirement that is met, as soon as that is known.
+
+    Returns:
+        The requirements that are met.
+
+    Raises:
+        ConformanceError: one is not, or the server cannot be reached.
     """
     let_connect(f"the server that is checked, {url}")
     try:

@@ -1,8 +1,11 @@
 """The memory of this process and of its machine, as Linux states it. Knows nothing of policies."""
 
 import contextlib
+import gc
 import resource
 from pathlib import Path
+
+import torch
 
 MEMINFO, CLEAR_REFS, STATUS = (Path("/proc") / name for name in ("meminfo", "self/clear_refs", "self/status"))
 
@@ -28,3 +31,16 @@ def available_bytes() -> int | None:
         return None
     fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
     return int(fields["MemAvailable"].split()[0]) * 1024
+
+
+def reset_device_peak(device: str) -> None:
+    """Free what is not used, and start the peak from what is left, not from a model measured before."""
+    if torch.device(device).type == "cuda":
+        gc.collect()  # a policy and its processors refer to each other
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak_device_bytes(device: str) -> int | None:
+    """Return the most memory of tensors since `reset_device_peak`; None on a CPU."""
+    return torch.cuda.max_memory_allocated(device) if torch.device(device).type == "cuda" else None

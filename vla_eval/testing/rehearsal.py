@@ -36,8 +36,13 @@ from vla_eval.models.episodes.memory import remembers_in_rows
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
-from vla_eval.testing.device_memory import peak_device_bytes, reset_device_peak
-from vla_eval.testing.process_memory import available_bytes, peak_rss_bytes, reset_peak
+from vla_eval.testing.process_memory import (
+    available_bytes,
+    peak_device_bytes,
+    peak_rss_bytes,
+    reset_device_peak,
+    reset_peak,
+)
 from vla_eval.testing.random_checkpoint import PART, TASK, built_tiny, stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsed import Estimated, Rehearsed, limit_bytes
 from vla_eval.training.cost.description import describe_model
@@ -130,7 +135,12 @@ class _Loading:
 def _measured(one: _Loading, before: int, estimated: Estimated, batches: Sequence[int]) -> Rehearsed:
     n_bytes = (one.folder / WEIGHTS_FILE).stat().st_size
     limit, device = limit_bytes(n_bytes), one.options.device
-    _check_memory(limit, device)
+    available = available_bytes()
+    if device == "cpu" and available is not None and available < limit:
+        raise CheckpointError(
+            f"expected {limit / GB:.1f} GB of memory for this model, found {available / GB:.1f} GB "
+            "available. Close other programs, or rehearse it on another machine."
+        )
     model = _load_and_act(one)
     on_device = peak_device_bytes(device)
     parameters = sum(x.numel() for x in model.parameters())
@@ -209,7 +219,9 @@ def _load_and_act(one: _Loading) -> Any:
     n_action_steps = int(getattr(one.config, "n_action_steps", 1))
     chunking = ChunkingSpec(n_action_steps=min(n_action_steps, N_STEPS // 2))
     context = PolicyContext(name="rehearsal", env=env.spec, chunking=chunking, n_candidates=3)
-    cameras, device = _cameras(one.config), one.options.device
+    not_cameras = getattr(one.config, "memory_fields", ())
+    fields = [field for field in one.config.image_features if field not in not_cameras]
+    cameras, device = dict(zip(CAMERA_KEYS, fields, strict=True)), one.options.device
     reset_peak()
     reset_device_peak(device)
     started = time.perf_counter()
@@ -244,19 +256,3 @@ def _rates(folder: Path, device: str, batches: Sequence[int]) -> dict[int, float
             loaded.postprocessor(chunk)  # on the CPU at its end, so that the device has finished
             rates[n] = n / (time.perf_counter() - started)
     return rates
-
-
-def _cameras(config: Any) -> dict[str, str]:
-    """Return the field that each camera's images have in the checkpoint."""
-    not_cameras = getattr(config, "memory_fields", ())
-    fields = [field for field in config.image_features if field not in not_cameras]
-    return dict(zip(CAMERA_KEYS, fields, strict=True))
-
-
-def _check_memory(limit: int, device: str) -> None:
-    available = available_bytes()
-    if device == "cpu" and available is not None and available < limit:
-        raise CheckpointError(
-            f"expected {limit / GB:.1f} GB of memory for this model, found {available / GB:.1f} GB "
-            "available. Close other programs, or rehearse it on another machine."
-        )

@@ -19,8 +19,8 @@ from vla_eval.data.manifest import encode_actions, read_manifest
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import SpecMismatchError
 from vla_eval.features import rotation_columns
+from vla_eval.models.memory.action_head import JOINT_UNIT_RAD, REST_RAD, JointLayer
 from vla_eval.models.memory.configuration_memory import MikasaMemoryConfig
-from vla_eval.models.memory.joint_layer import JOINT_UNIT_RAD, REST_RAD, JointLayer
 from vla_eval.models.memory.modeling_memory import MikasaMemoryPolicy, foreseen_alone
 from vla_eval.models.memory.network import Answer
 from vla_eval.oracles.kinematics import tool_pose

@@ -9,8 +9,13 @@ import torch
 from torch.nn import functional
 
 from tests.models.openvla import openvla_golden as golden
-from vla_eval.models.openvla.action_tokens import from_tokens, to_tokens
-from vla_eval.models.openvla.generation import generated_actions, parallel_actions, token_loss
+from vla_eval.models.openvla.generation import (
+    from_tokens,
+    generated_actions,
+    parallel_actions,
+    to_tokens,
+    token_loss,
+)
 from vla_eval.models.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.models.openvla.sizes import NetworkOptions
 from vla_eval.models.shared.prompts import Prompts

@@ -9,9 +9,16 @@ from torch import Tensor
 from vla_eval.errors import VlaEvalError
 from vla_eval.models.sequence.core import Core
 from vla_eval.models.sequence.cores import make_core
-from vla_eval.models.sequence.encoders import FRAMES_AT_ONCE, Cameras, Keypoints, Nature, ShapesAndColors
+from vla_eval.models.sequence.encoders import (
+    FRAMES_AT_ONCE,
+    LEAST_VARIANCE,
+    Cameras,
+    Keypoints,
+    Nature,
+    ShapesAndColors,
+    spatial_softmax,
+)
 from vla_eval.models.sequence.sizes import CORES, ENCODERS
-from vla_eval.models.sequence.spatial_softmax import LEAST_VARIANCE, spatial_softmax
 
 WIDTH, N_STEPS = 8, 12
 SMALL_OPTIONS: dict[str, dict[str, Any]] = {

@@ -14,12 +14,12 @@ from torch import Tensor
 from tests.models import golden_folder
 from vla_eval.models.shared.prompts import Prompts
 from vla_eval.models.spatialvla.action_grid import AXES, ActionGrid, Gaussian, gaussian_grid
-from vla_eval.models.spatialvla.camera import intrinsics, resized_intrinsics
+from vla_eval.models.spatialvla.conversion import to_ours
 from vla_eval.models.spatialvla.depth import zoe_config, zoe_depth
 from vla_eval.models.spatialvla.described import GRID_PARTS
+from vla_eval.models.spatialvla.ego3d import intrinsics, resized_intrinsics
 from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.models.spatialvla.sizes import NetworkSizes
-from vla_eval.models.spatialvla.weight_names import to_ours
 from vla_eval.models.weights.exact import put_weights
 
 FOLDER = Path(__file__).parents[2] / "golden" / "spatialvla"

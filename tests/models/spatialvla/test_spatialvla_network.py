@@ -10,13 +10,12 @@ from torch import Tensor, nn
 from tests.models.original_names import spatialvla_names
 from tests.models.spatialvla import spatialvla_golden as golden
 from tests.models.spatialvla.spatialvla_golden import CHUNK, ELSEWHERE, LOGITS, ROOT_OF_WIDTH, SIZES
-from vla_eval.models.spatialvla.action_tokens import to_tokens
+from vla_eval.models.spatialvla.conversion import to_ours
 from vla_eval.models.spatialvla.depth import cut_depth, shown_images
 from vla_eval.models.spatialvla.ego3d import frequencies, patch_points
-from vla_eval.models.spatialvla.generation import generated_actions, generated_tokens, token_loss
+from vla_eval.models.spatialvla.generation import generated_actions, generated_tokens, to_tokens, token_loss
 from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.models.spatialvla.sizes import TOKENS_PER_ACTION, Attention, NetworkSizes
-from vla_eval.models.spatialvla.weight_names import to_ours
 
 N_PROMPTS = len(golden.config()["prompts"])
 ALL = [[index] for index in range(len(golden.values()["in.images"]))]

@@ -20,10 +20,9 @@ from vla_eval.errors import (
 )
 from vla_eval.models.shared.images import Size, resize_bicubic
 from vla_eval.models.shared.language_processors import byte_tokenizer
-from vla_eval.models.spatialvla.action_grid import uniform_grid
-from vla_eval.models.spatialvla.action_tokens import to_tokens
+from vla_eval.models.spatialvla.action_grid import refitted, uniform_grid
 from vla_eval.models.spatialvla.configuration_spatialvla import LinearDecaySchedulerConfig
-from vla_eval.models.spatialvla.grid_refit import refitted
+from vla_eval.models.spatialvla.generation import to_tokens
 from vla_eval.models.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
 from vla_eval.models.spatialvla.prompt import finished, prompt_text
 from vla_eval.models.weights.trainable import check_lora, trainable

@@ -17,11 +17,11 @@ from vla_eval.models.spatialvla.action_grid import (
     ActionGrid,
     fitted_gaussians,
     from_spherical,
+    refitted,
     to_spherical,
     uniform_grid,
 )
-from vla_eval.models.spatialvla.action_tokens import from_tokens, to_tokens
-from vla_eval.models.spatialvla.grid_refit import refitted
+from vla_eval.models.spatialvla.generation import from_tokens, to_tokens
 from vla_eval.models.spatialvla.sizes import NetworkSizes
 
 SIZES = golden.SIZES

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from vla_eval.errors import RecipeError, SpecMismatchError
 from vla_eval.policies.remote.actions import as_rows, converted
-from vla_eval.policies.remote.images import resized
+from vla_eval.policies.remote.fit import resized
 from vla_eval.policies.remote.settings import ActionSettings, remote_settings, settings_digest
 from vla_eval.policies.remote.state_layouts import axis_angle, state_layout
 from vla_eval.specs import EnvSpec, StateSpec

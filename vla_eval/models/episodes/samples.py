@@ -184,8 +184,10 @@ def _shares(config: EpisodeConfig, actions: Tensor) -> Tensor:
 
 def _augmented(images: Tensor, episodes: Tensor, config: EpisodeConfig, *, n_episodes: int) -> Tensor:
     """Return images (N, …) of these episodes (N,), changed alike in all frames of an episode."""
-    mixed = _mixed(images, episodes, n_episodes) if config.mix_colors else images
-    return _moved(mixed, episodes, n_episodes, config.shift_px) if config.shift_px else mixed
+    if config.mix_colors:  # an order of the three colours of its own for each episode
+        orders = torch.rand(n_episodes, 3, device=images.device).argsort(dim=1)[episodes]
+        images = images.take_along_dim(orders[:, None, :, None, None], dim=-3)
+    return _moved(images, episodes, n_episodes, config.shift_px) if config.shift_px else images
 
 
 def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:
@@ -261,12 +263,6 @@ def _with_other_things(
             )
     changed = torch.cat(parts)
     return changed if images.dtype == torch.uint8 else in_numbers(changed)
-
-
-def _mixed(images: Tensor, episodes: Tensor, n_episodes: int) -> Tensor:
-    """Let the three colours of each episode change places; an order of its own for each."""
-    orders = torch.rand(n_episodes, 3, device=images.device).argsort(dim=1)[episodes]
-    return images.take_along_dim(orders[:, None, :, None, None], dim=-3)
 
 
 def _moved(images: Tensor, episodes: Tensor, n_episodes: int, most_px: int) -> Tensor:

@@ -17,9 +17,9 @@ from vla_eval.models.episodes.samples import (
     weighted_mean,
 )
 from vla_eval.models.episodes.sentence import said_at_each_step
+from vla_eval.models.memory.action_head import action_units
 from vla_eval.models.memory.configuration_memory import TYPE, MikasaMemoryConfig
 from vla_eval.models.memory.goal_layer import by_camera
-from vla_eval.models.memory.joint_layer import action_units
 from vla_eval.models.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.models.memory.sizes import NetworkSizes
 from vla_eval.models.shared.levels import in_numbers

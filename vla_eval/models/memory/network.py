@@ -21,9 +21,8 @@ from torch.nn import functional
 from vla_eval.models.episodes.config import POSITION_SCALE, SPACE, STATE
 from vla_eval.models.episodes.samples import last_of
 from vla_eval.models.episodes.sentence import SentenceEncoder, with_sentence
-from vla_eval.models.memory.action_head import WAY_SCALE_M, ActionHead
+from vla_eval.models.memory.action_head import WAY_SCALE_M, ActionHead, JointLayer
 from vla_eval.models.memory.goal_layer import GoalLayer
-from vla_eval.models.memory.joint_layer import JointLayer
 from vla_eval.models.memory.sizes import KNOWN, PLACE, NetworkSizes
 from vla_eval.models.memory.vision_encoder import Keys, Likeness, Places, StandingOut, VisionEncoder
 from vla_eval.models.shared.precision import in_float32

@@ -19,18 +19,12 @@ class NetworkSizes:
     Attributes:
         on_arm: of each image of a step, whether its camera is on the arm.
         image_px: height and width of an image, a multiple of `patch_px`.
-        action: dimensions of an action.
-        chunk: actions of a chunk.
         channels: learned features of a place in an image.
         patch_px: edge of such a place, a multiple of `SPOTS`.
         heads: questions per camera: so many fixed ones, and so many of the memory.
         key: numbers of a question.
-        memory: units of the memory.
-        hidden: units of the layers between.
         longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
         free_translation: whether a part of the translation does not depend on the goal.
-        joint_targets: whether an action is joint positions and the gripper.
-        reads_sentence: whether the instruction is read.
     """
 
     on_arm: tuple[bool, ...] = (False, True)

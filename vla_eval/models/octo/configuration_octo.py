@@ -50,7 +50,6 @@ class MikasaOctoConfig(PortedConfig):
         tokenizer_name: folder or name of the tokenizer, or `bytes`.
         primary_crop_area, primary_crop_ratio, brightness, contrast, saturation, hue: augmentation, see
             `Augmentation`; only the first camera is cropped, and in evaluation its middle is taken.
-        augment: whether training images are changed at all.
         gripper_encoding, gripper_decoding: see `Gripper`.
         normalize_gripper: whether the gripper is normalised, too; the original leaves it alone.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,

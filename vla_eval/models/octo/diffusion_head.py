@@ -27,12 +27,7 @@ LEAST_SHARE = 1e-5  # of entries that count, in the mean over them
 class HeadSizes:
     """What the head is made of; the defaults are Octo's.
 
-    Attributes:
-        condition: width of the readout.
-        chunk, action: steps of a chunk, dimensions of an action.
-        hidden, blocks, time: widths and number of residual blocks.
-        diffusion_steps: from noise to action.
-        max_action: normalised actions and samples are cut to ± this.
+    `condition` is the readout's width; normalised actions and samples are cut to ± `max_action`.
     """
 
     condition: int

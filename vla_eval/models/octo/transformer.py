@@ -34,8 +34,6 @@ class TransformerSizes:
         image_px: camera of the model -> edge of its square images, in the order of the tokens.
         max_window: longest window that there are position embeddings for.
         language_tokens, language_width: of the embedded instruction.
-        width, layers, heads, mlp_width: of the transformer.
-        stem_channels, stem_features: of the convolutions before it.
     """
 
     image_px: Mapping[str, int]
@@ -57,7 +55,6 @@ class Window(NamedTuple):
         images: camera -> (B, W, 3, px, px) in levels [0, 255].
         image_mask: camera -> (B, W), False where a camera gave no image.
         step_mask: (B, W), False for steps before the episode began.
-        language_BLD: the embedded instruction.
         language_mask: (B,), False where there is none.
     """
 

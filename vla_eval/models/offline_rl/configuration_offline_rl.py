@@ -64,7 +64,6 @@ class MikasaOfflineRLConfig(PortedConfig):
         width: numbers that the encoder returns.
         hidden: units of the two layers of actor and critics.
         dropout: in these layers.
-        discount: of the rewards.
         target_rate: share by which the slow critics follow in each step (Polyak averaging).
         conservative_weight: of the conservative penalty of CQL.
         n_sampled_actions: drawn for it from each of three distributions.

@@ -48,7 +48,9 @@ def read_original(source: Path, options: OpenVLAOptions) -> Original:
     """Read a folder with `config.json`, safetensors and tokenizer of an OpenVLA."""
     described = read_json(source / CONFIG_FILE)
     if not options.sizes:
-        _check_backbones(source, described)
+        for name, expected in BACKBONES.items():
+            if described.get(name, expected) != expected:
+                raise CheckpointError(f"{source}: {name}: expected {expected}, found {described[name]}.")
     config = _config(source, options)
     statistics = read_statistics(source, described, config, options.unnorm_key)
     fields = None if statistics is None else read_normalizations(source, statistics, config)
@@ -181,12 +183,6 @@ def _pickled(source: Path, name: str, *, allowed: bool) -> dict[str, Tensor]:
 def _step(file: Path) -> int:
     number = re.search(r"--(\d+)_", file.name)
     return int(number[1]) if number else -1
-
-
-def _check_backbones(source: Path, described: Mapping[str, Any]) -> None:
-    for name, expected in BACKBONES.items():
-        if described.get(name, expected) != expected:
-            raise CheckpointError(f"{source}: {name}: expected {expected}, found {described[name]}.")
 
 
 def _check_tokenizer(tokenizer: Any) -> None:

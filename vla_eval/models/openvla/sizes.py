@@ -23,10 +23,8 @@ class NetworkSizes(VisionSizes):
     Attributes:
         dino_width, dino_depth, dino_heads, dino_registers: DINOv2 as published. The last of `dino_depth`
             blocks is never run: its output is not used, so the network does not have it.
-        llm_width, llm_depth, llm_heads, llm_mlp: Llama.
         vocabulary: rows of the embedding; `text_vocabulary`: those of the tokenizer. Action bins are the
             last `N_BINS - 1` of the latter, counted from behind.
-        bos_token, stop_token, pad_token, empty_token: numbers of these tokens.
     """
 
     dino_width: int = 1024
@@ -69,7 +67,6 @@ class NetworkOptions:
         head: `l1`: all actions of the chunk at once, continuous (OFT). `parallel_tokens`: at once, as
             tokens (OFT without its head). `tokens`: one token after the other (OpenVLA as published).
         chunk: actions of a chunk; a part of the architecture, it cannot be changed after training.
-        action: numbers of an action.
         proprio: numbers of the proprioception; 0: the model has none.
     """
 

@@ -34,7 +34,8 @@ class FusedVision(nn.Module):
         super().__init__()
         self.n_prefix_tokens = 1 + sizes.dino_registers
         self.dino = _dino(sizes)
-        self.siglip = _siglip(sizes)
+        self.siglip = siglip(sizes, n_blocks=sizes.siglip_depth - 1, activation=GELU)
+        self.siglip.post_layernorm = nn.Identity()
         means = torch.tensor([IMAGENET_MEAN, SIGLIP_MEAN], dtype=torch.float32).reshape(2, 1, 3, 1, 1)
         stds = torch.tensor([IMAGENET_STD, SIGLIP_STD], dtype=torch.float32).reshape(2, 1, 3, 1, 1)
         self.register_buffer("mean", means, persistent=False)
@@ -88,9 +89,3 @@ def _dino(sizes: NetworkSizes) -> Any:
     model.layernorm = nn.Identity()
     del model.embeddings.mask_token  # only for pre-training; the original has none
     return model
-
-
-def _siglip(sizes: NetworkSizes) -> Any:
-    tower = siglip(sizes, n_blocks=sizes.siglip_depth - 1, activation=GELU)
-    tower.post_layernorm = nn.Identity()
-    return tower

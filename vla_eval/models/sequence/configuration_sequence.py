@@ -45,11 +45,9 @@ class MikasaSequenceConfig(EpisodeConfig):
         target_return: the return to go at inference, the same at every step. None: 1 for sparse rewards; for
             others the highest return of the dataset's episodes.
         width: units of a token, of the core and of the head.
-        layers: of the core.
         heads: of its attention, where it has any.
         context_steps: the steps, the newest among them, that a layer of a transformer sees; of cores that
             read an episode in segments, the steps of one.
-        dropout: of the core.
     """
 
     core: str = "gru"

@@ -119,7 +119,8 @@ class CausalTransformer(Core):
         # is fixed: one that depends on them would choose other kernels, and other bits.
         trims = self.training or len(kept) == 1
         first = int((n_kept - n_before).clamp(min=0).min()) if trims else 0
-        read = all_tokens[:, first:] + self._positions(step[:, first:])
+        angles = step[:, first:, None] * self.frequencies
+        read = all_tokens[:, first:] + torch.cat([angles.sin(), angles.cos()], dim=-1)
         distance = place[first:, None] - place[None, first:]
         hidden = (distance < 0) | (distance >= self.context_steps)
         absent = (place[first:] < -n_before[:, None])[:, None, :]
@@ -128,10 +129,6 @@ class CausalTransformer(Core):
         blocked = (hidden | absent) & ~itself
         answers = self.blocks(read, mask=blocked.repeat_interleave(self.heads, dim=0))[:, -n_new:]
         return answers, (all_tokens[:, -n_kept:], n_before + n_new)
-
-    def _positions(self, steps: Tensor) -> Tensor:
-        angles = steps[..., None] * self.frequencies
-        return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
 
 def make_core(

@@ -13,9 +13,9 @@ Shapes: B episodes, T tokens of a segment, S slots, L layers, W width, H heads.
 
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
 from vla_eval.models.sequence.core import CoreMemory
-from vla_eval.models.sequence.experts import Experts
 from vla_eval.models.sequence.relative_attention import (
     RelativeAttention,
     RelativeBiases,
@@ -148,7 +148,10 @@ class Elmur(Segmented):
         apart = self.drop(sinusoids(distances, self.width))
         allowed = causal(n_tokens, n_tokens, device)[None]
         lag = number[:, :, None] - written[:, None, :]
-        chosen, is_empty = self._slot(written)
+        # The first of the oldest: numbers of slots decide between those that are as old.
+        order = written * self.options.slots + torch.arange(self.options.slots, device=written.device)
+        chosen = order.argmin(dim=1)
+        is_empty = written.gather(1, chosen[:, None])[:, 0] == EMPTY
         index = chosen[:, None, None].expand(-1, 1, self.width)
         stream, after = self.drop(tokens), []
         for number_of_layer, layer in enumerate(self.layers):
@@ -165,9 +168,38 @@ class Elmur(Segmented):
         written = written.scatter(1, chosen[:, None], number[:, :1])
         return stream, (slots, written, n_segments + 1)
 
-    def _slot(self, written: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the number (B,) of the slot that is written next, and whether it is empty (B,)."""
-        # The first of the oldest: numbers of slots decide between those that are as old.
-        order = written * self.options.slots + torch.arange(self.options.slots, device=written.device)
-        chosen = order.argmin(dim=1)
-        return chosen, written.gather(1, chosen[:, None])[:, 0] == EMPTY
+
+class Experts(nn.Module):
+    """A feed-forward layer: each token is sent to one of `experts`, and to one that takes all.
+
+    Source: offline_rl_baselines/ELMUR/layers/mixture_of_experts.py at `top_k: 2` with one shared expert.
+    There as here a single chosen expert has the weight 1, so that neither the loss nor the source's balancing
+    term, which is left out, teaches the router anything: it stays the random partition that it begins as.
+    """
+
+    def __init__(self, *, width: int, inner_width: int, experts: int, dropout: float) -> None:
+        super().__init__()
+        # The last expert is the one for all tokens. Gated layers: Shazeer 2020, SwiGLU.
+        self.gates = nn.Parameter(torch.empty(experts + 1, inner_width, width))
+        self.values = nn.Parameter(torch.empty(experts + 1, inner_width, width))
+        self.outs = nn.Parameter(torch.empty(experts + 1, width, inner_width))
+        self.router = nn.Linear(width, experts, bias=False)
+        for stack in (self.gates, self.values, self.outs):
+            for weight in stack:
+                nn.init.xavier_uniform_(weight)
+        nn.init.xavier_uniform_(self.router.weight)
+        self.router.requires_grad_(False)
+        self.drop = nn.Dropout(dropout)
+
+    def forward(self, tokens: Tensor) -> Tensor:
+        """Return (B, T, W) of tokens (B, T, W).
+
+        All experts compute all tokens: a pass whose shapes depended on the choices would give a row other
+        bits beside other rows.
+        """
+        chosen = functional.one_hot(self.router(tokens).argmax(dim=-1), self.router.out_features)
+        taken = functional.pad(chosen, (0, 1), value=1).to(tokens.dtype)
+        inner = functional.silu(torch.einsum("btw,efw->btef", tokens, self.gates))
+        inner = self.drop(inner * torch.einsum("btw,efw->btef", tokens, self.values)) * taken[..., None]
+        returned: Tensor = self.drop(torch.einsum("btef,ewf->btw", inner, self.outs))
+        return returned

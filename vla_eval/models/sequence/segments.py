@@ -42,16 +42,13 @@ class Segmented(Core):
         answers: list[Tensor] = []
         n_read = 0
         while n_read < tokens.shape[1]:
-            n_next = self._fits(memory[1], tokens.shape[1] - n_read)
+            # How many of the tokens left fit into the segments of all rows at once.
+            fewest, most = int(memory[1].min()), int(memory[1].max())
+            n_next = min(self.segment - most, tokens.shape[1] - n_read) if fewest == most else 1
             answer, memory = self._piece(tokens[:, n_read : n_read + n_next], memory)
             answers.append(answer)
             n_read += n_next
         return torch.cat(answers, dim=1), memory
-
-    def _fits(self, n_tokens: Tensor, n_left: int) -> int:
-        """Return how many of the tokens left fit into the segments of all rows at once."""
-        fewest, most = int(n_tokens.min()), int(n_tokens.max())
-        return min(self.segment - most, n_left) if fewest == most else 1
 
     def _piece(self, new: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
         room, n_tokens, *kept = memory

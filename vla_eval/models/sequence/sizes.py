@@ -42,9 +42,7 @@ class TransformerXLOptions:
     """Sizes of Decision Transformer, RATE and GTrXL beyond those of every core.
 
     Attributes:
-        head_width: units of a head of attention.
         inner_width: of the feed-forward layers; 0: there are none.
-        attention_dropout: of attention's weights.
         cached_tokens: hidden states of earlier segments that are kept.
         memory_tokens: that a segment reads at its beginning and writes at its end.
         valve_heads: of the attention between old memory tokens and what was written; 0: there is no valve.
@@ -100,9 +98,6 @@ class ElmurOptions:
         blend: share of what is new in a slot that is written again.
         slot_scale: standard deviation of what slots hold before they are written.
         experts: each token is sent to one of them, and to the one for all.
-        inner_width: of an expert.
-        attention_dropout: of attention's weights.
-        memory_dropout: of what is written.
         longest: distances in tokens beyond this count as this.
         carries_gradient: whether later segments teach a segment what to write.
     """

@@ -27,7 +27,6 @@ class Original:
     """What a converter has found.
 
     Attributes:
-        config: of the policy.
         weights: function from the policy, without values, to its tensors by name.
         make_processors: makes pre- and postprocessor from the configuration.
         casts: whether types of numbers may differ from the configuration's.

@@ -25,7 +25,6 @@ class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untype
     Attributes:
         chunk_size: actions of a chunk.
         n_action_steps: how many lerobot's own loop executes, the first ones; ours sets its own number.
-        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm: of AdamW.
         scheduler_warmup_steps: over which the learning rate rises from 0.
         normalization_mapping: of lerobot's own normaliser, which none of these policies uses.
     """
@@ -90,7 +89,6 @@ class PromptedConfig(PortedConfig):
         sizes: sizes that differ from the published model's, see the policy's `NetworkSizes`.
         dtype: of the network: `float32`, `bfloat16`.
         gradient_checkpointing: recompute activations in the backward pass.
-        gripper: how the gripper is encoded.
         do_mask_loss_for_padding: leave actions beyond an episode's end out of the loss. False: chunks that
             have any are refused.
         drop_n_last_frames: set by `__post_init__` for that; lerobot's sampler reads it.

@@ -86,7 +86,12 @@ class SentenceWatch:
         if reading.sentence not in self._tasks:
             alike.append(reading)
             if reading.n_tokens > len(reading.ids):
-                said.append(self._cut(reading))
+                said.append(
+                    f"policy '{self._policy}' reads {len(reading.ids)} of the {reading.n_tokens} tokens of "
+                    f"{quoted(reading.sentence)} (its limit: {reading.limit}). What is left: "
+                    f"{quoted(reading.kept)}. Use a shorter sentence, or train with a higher limit where the "
+                    "policy's configuration has one."
+                )
         own = self._tasks.setdefault(reading.sentence, set())
         own.add(task or reading.sentence)
         for other in alike:
@@ -95,13 +100,6 @@ class SentenceWatch:
                 self._said.add(pair)
                 said.append(self._same(other, reading))
         return said
-
-    def _cut(self, one: SentenceReading) -> str:
-        return (
-            f"policy '{self._policy}' reads {len(one.ids)} of the {one.n_tokens} tokens of "
-            f"{quoted(one.sentence)} (its limit: {one.limit}). What is left: {quoted(one.kept)}. Use "
-            "a shorter sentence, or train with a higher limit where the policy's configuration has one."
-        )
 
     def _same(self, *pair: SentenceReading) -> str:
         # By their sentences: which of them a worker reads first is chance.

@@ -1,4 +1,4 @@
-"""Adaptive action grids: where the bins of translation and rotation lie. Knows nothing of tokens or networks.
+"""Adaptive action grids: where the bins of translation and rotation lie. Knows no network.
 
 A translation is given by its direction (theta from the z axis, phi around it) and its length r, in
 normalised units; a rotation by its three numbers. On each axis the edges are either even or quantiles of a
@@ -122,3 +122,39 @@ def from_spherical(spherical: Tensor) -> Tensor:
 def _even(low: float, high: float, n: int) -> tuple[float, ...]:
     # numpy's and not torch's: the original's edges, to the last bit, where an action lies on one.
     return tuple(map(float, np.linspace(low, high, n + 1)))
+
+
+def refitted(table: Tensor, old: ActionGrid, new: ActionGrid) -> Tensor:
+    """Return the table (tokens, D) of the new grid, of as many bins, in the type of the old one.
+
+    A token's embedding is read from the old table at its new place: linearly along each of the three axes,
+    between the middles of the old bins, and at the outermost middle beyond it. The gripper's two rows stay.
+    The original interpolates over a Delaunay triangulation, which on a regular grid depends on the version of
+    SciPy, and takes the first two axes for each other; both are left out here (docs/spatialvla.md).
+    """
+    if old.n_bins != new.n_bins:
+        raise RecipeError(
+            f"an action grid of {old.n_bins} bins cannot be moved to one of {new.n_bins}: the tokens would "
+            "not be the same. Leave the numbers of bins in `sizes` as the base has them."
+        )
+    parts, begin = [], 0
+    for axes in (TRANSLATION, ROTATION):
+        shape = old.n_bins[axes]
+        n = shape[0] * shape[1] * shape[2]
+        cube = table[begin : begin + n].double().reshape(*shape, -1)
+        for place, axis in enumerate(range(axes.start, axes.stop)):
+            weights = _weights(old.centres(axis, table.device), new.centres(axis, table.device))
+            cube = torch.tensordot(weights, cube.movedim(place, 0), dims=1).movedim(0, place)
+        parts.append(cube.reshape(n, -1))
+        begin += n
+    return torch.cat([*parts, table[begin:].double()]).to(table.dtype)
+
+
+def _weights(old: Tensor, new: Tensor) -> Tensor:
+    """Return (n, n): how much each old bin counts in each new one; rows sum to 1."""
+    places = new.clamp(old[0], old[-1])
+    right = torch.bucketize(places, old, right=True).clamp(1, len(old) - 1)
+    share = (places - old[right - 1]) / (old[right] - old[right - 1])
+    weights = torch.zeros(len(new), len(old), dtype=old.dtype, device=old.device)
+    weights.scatter_(1, (right - 1)[:, None], (1 - share)[:, None])
+    return weights.scatter_(1, right[:, None], share[:, None])

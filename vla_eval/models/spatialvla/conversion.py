@@ -31,7 +31,6 @@ from vla_eval.models.spatialvla.described import GRID_PARTS, PROCESSOR_FILE, che
 from vla_eval.models.spatialvla.processor_spatialvla import make_mikasa_spatialvla_pre_post_processors
 from vla_eval.models.spatialvla.prompt import finished, prompt_text
 from vla_eval.models.spatialvla.sizes import Attention, NetworkSizes
-from vla_eval.models.spatialvla.weight_names import EMBEDDINGS, HEAD, to_ours
 from vla_eval.strict.json_fields import read_json
 
 ORIGINALS_INFERENCE: Attention = "bidirectional"
@@ -143,3 +142,26 @@ def _check_tokenizer(source: Path, tokenizer: Any, sizes: NetworkSizes) -> None:
             f"{source}: expected the token <image> to have the number {sizes.image_token}, found "
             f"{tokenizer.convert_tokens_to_ids('<image>')}."
         )
+
+
+# Beginnings of names, (original, ours); a name that begins with none of them is kept.
+BEGINNINGS: tuple[tuple[str, str], ...] = (
+    ("vision_tower.vision_model.", "vision."),
+    ("language_model.lm_head.", "lm_head."),
+    ("language_model.model.", "llm."),
+    ("multi_modal_projector.linear.", "projector."),
+    ("vision_zoe_model.", "depth.zoe."),
+)
+EMBEDDINGS, HEAD = "language_model.model.embed_tokens.weight", "language_model.lm_head.weight"
+
+
+def to_ours(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the original's tensors under our names; an unknown name stays, and the loader refuses it."""
+    return {_renamed(name, BEGINNINGS): tensor for name, tensor in weights.items()}
+
+
+def _renamed(name: str, pairs: tuple[tuple[str, str], ...]) -> str:
+    for old, new in pairs:
+        if name.startswith(old):
+            return new + name.removeprefix(old)
+    return name

@@ -11,10 +11,10 @@ from vla_eval.models.shared.chunks import PromptedChunks
 from vla_eval.models.shared.images import Size, resize_bicubic
 from vla_eval.models.shared.levels import MAX_LEVEL
 from vla_eval.models.shared.precision import default_dtype
-from vla_eval.models.spatialvla.camera import intrinsics, resized_intrinsics
+from vla_eval.models.spatialvla.action_grid import refitted
 from vla_eval.models.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
+from vla_eval.models.spatialvla.ego3d import intrinsics, resized_intrinsics
 from vla_eval.models.spatialvla.generation import generated_actions, token_loss
-from vla_eval.models.spatialvla.grid_refit import refitted
 from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.models.spatialvla.prompt import finished
 

@@ -81,7 +81,11 @@ class SpatialVLANetwork(nn.Module):
         """Return the tokens (B, C · P, D) of the images, one image after the other."""
         images = inputs.images.flatten(0, 1)
         seen = self.vision(((images.float() - SIGLIP_MEAN) / SIGLIP_STD).to(self.projector.weight.dtype))
-        places = self.position_embedding_3d(self._depth(inputs), inputs.intrinsics.flatten(0, 1))
+        given = (
+            self.depth(inputs.images.flatten(0, 1)) if inputs.depth is None else inputs.depth.flatten(0, 1)
+        )
+        depth = cut_depth(given, self.sizes.image_px)
+        places = self.position_embedding_3d(depth, inputs.intrinsics.flatten(0, 1))
         features: Tensor = self.projector(seen.last_hidden_state + places)
         return features.reshape(len(inputs.images), -1, features.shape[-1])
 
@@ -146,14 +150,6 @@ class SpatialVLANetwork(nn.Module):
         head = self.lm_head.weight if self.sizes.llm_own_head else self.llm.embed_tokens.weight
         logits = nn.functional.linear(hidden, head).float()
         return LOGIT_CAP * torch.tanh(logits / LOGIT_CAP)
-
-    def _depth(self, inputs: Inputs) -> Tensor:
-        """Return (B · C, image_px, image_px) metres."""
-        if inputs.depth is not None:
-            depth = inputs.depth.flatten(0, 1)
-        else:
-            depth = self.depth(inputs.images.flatten(0, 1))
-        return cut_depth(depth, self.sizes.image_px)
 
 
 def _followed(prompts: Prompts, action_ids: Tensor, sizes: NetworkSizes) -> tuple[Tensor, int]:

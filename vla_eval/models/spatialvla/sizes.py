@@ -31,15 +31,11 @@ class NetworkSizes(VisionSizes):
     """Sizes of all parts.
 
     Attributes:
-        llm_width, llm_depth, llm_heads, llm_kv_heads, llm_head_width, llm_mlp: Gemma 2.
         llm_own_head: 1: Gemma has an output matrix of its own, as published; 0: that of its input, as Gemma 2
             itself and the golden files.
         depth_px, depth_width, depth_layers, depth_heads, depth_mlp: ZoeDepth's encoder (BEiT); without
             layers there is no depth model, and depth has to be given.
-        depth_neck, depth_fusion, depth_features, depth_embedding, depth_bins: the rest of ZoeDepth.
         theta_bins, phi_bins, r_bins: of the translation's direction and length.
-        roll_bins, pitch_bins, yaw_bins: of the rotation.
-        pad_token, stop_token, bos_token, newline_token, image_token: numbers of these tokens.
         first_action_token: of the first action token; they are the last of the vocabulary.
     """
 

@@ -40,7 +40,9 @@ class RemembersMixin:
         super().__init__(config, **kwargs)  # type: ignore[call-arg]  # of lerobot's class
         if not config.memory_tokens:
             return
-        self.memory_tokens = MemoryTokens(config.memory_tokens, self._width())
+        pair = self.backbone()
+        width = int(getattr(pair, "paligemma", pair).config.text_config.hidden_size)
+        self.memory_tokens = MemoryTokens(config.memory_tokens, width)
         extend(self.model, TakesTokens)
         extend(self.backbone(), CatchesPrefix)
         self.remember, self.begin_memory = self._remember, self._begin_memory
@@ -133,11 +135,6 @@ class RemembersMixin:
             yield
         finally:
             self.model.given = self.backbone().prefix = None
-
-    def _width(self) -> int:
-        """Return the width of the language model."""
-        pair = self.backbone()
-        return int(getattr(pair, "paligemma", pair).config.text_config.hidden_size)
 
     def _outputs(self) -> Tensor:
         prefix: Tensor = self.backbone().prefix

@@ -106,21 +106,17 @@ def make_hold(context: PolicyContext) -> ScriptedPolicy:
     return HoldPolicy(context)
 
 
-def _make_expert_policy(context: PolicyContext, mode: Mode) -> ScriptedPolicy:
-    expert = task_expert(context)
-    if context.n_candidates == 0:
-        return BallPolicy(context, cast(BallExpertFactory, expert), imagined=mode == "cue_blind")
-    if task_spec(context.env.task).several_right:
-        return VisitPolicy(context, cast(VisitExpert, expert), mode)
-    return ChoicePolicy(context, cast(CandidateExpert, expert), mode)
-
-
 def _maker(mode: Mode, does: str = "") -> Callable[[PolicyContext], ScriptedPolicy | TranslatedPolicy]:
     """Return what makes a control of the expert; one that `does` something with candidates needs some."""
 
     def make(context: PolicyContext) -> ScriptedPolicy:
         check_has(not does or context.n_candidates > 0, context, does, "has none")
-        return _make_expert_policy(context, mode)
+        expert = task_expert(context)
+        if context.n_candidates == 0:
+            return BallPolicy(context, cast(BallExpertFactory, expert), imagined=mode == "cue_blind")
+        if task_spec(context.env.task).several_right:
+            return VisitPolicy(context, cast(VisitExpert, expert), mode)
+        return ChoicePolicy(context, cast(CandidateExpert, expert), mode)
 
     return in_any_control_mode(make)
 

@@ -174,7 +174,14 @@ class LeRobotPolicy:
 
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
         """Infer for each window; each draws its own, and refuses a row that is not there or is taken."""
-        due = [self._shown(window) for window in windows]
+        due = [
+            self._slots[window.slot].shown(
+                [self._inputs.tensors(observation) for observation in window.frames],
+                step=window.last.step,
+                n_kept=1 - min(self._deltas, default=0),
+            )
+            for window in windows
+        ]
         if not self._batch:
             inferred = [self._infer([episode])[0] for episode in due]
         elif self._n_slots == 1:
@@ -186,13 +193,6 @@ class LeRobotPolicy:
         for episode, (_, memory) in zip(due, inferred, strict=True):
             self._slots[episode.start.slot] = replace(episode, unseen=(), memory=memory)
         return [chunk for chunk, _ in inferred]
-
-    def _shown(self, window: ObservationWindow) -> Episode:
-        return self._slots[window.slot].shown(
-            [self._inputs.tensors(observation) for observation in window.frames],
-            step=window.last.step,
-            n_kept=1 - min(self._deltas, default=0),
-        )
 
     @torch.no_grad()
     def _infer(self, rows: Sequence[Episode]) -> list[_Inferred]:

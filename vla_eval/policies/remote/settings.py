@@ -24,7 +24,6 @@ class CameraSettings:
     """How the image of a camera is sent.
 
     Attributes:
-        key: its name in a request.
         height_px, width_px: the size that the server wants; None: as the server says, else the camera's.
         resize: how to make that size of another one: `pad` keeps the proportions and fills with black at two
             sides, `plain` does not keep them. None: another size is an error.

@@ -20,13 +20,7 @@ MAX_WIDTH_M = 0.08  # between the Panda's fingers
 
 
 class StateLayout(NamedTuple):
-    """One layout.
-
-    Attributes:
-        states: the environment's states that it is computed from.
-        n_numbers: how long it is.
-        compute: from those states to (n_numbers,) float32.
-    """
+    """The environment's states that it is computed from, its length, and how: to (n_numbers,) float32."""
 
     states: tuple[str, ...]
     n_numbers: int

@@ -5,6 +5,7 @@ Nobody is waited for: a run that cannot start says so at once.
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple  # Any: what a recipe holds
 
@@ -67,16 +68,7 @@ def moved(recipe: Recipe[PolicyRecipe], urls: str) -> PolicyRecipe:
             f"'{recipe.value.adapter}' in {recipe.path}. For a server of this policy, name the address "
             f"alone: {urls:.200}"
         )
-    own = recipe.value
-    return PolicyRecipe(
-        version=own.version,
-        description=own.description,
-        adapter=own.adapter,
-        args={**own.args, "url": urls},
-        default_n_action_steps=own.default_n_action_steps,
-        max_workers=own.max_workers,
-        needs_candidates=own.needs_candidates,
-    )
+    return replace(recipe.value, args={**recipe.value.args, "url": urls}, finetune=None)
 
 
 def _survey(settings: RemoteSettings) -> ServerMetadata:
