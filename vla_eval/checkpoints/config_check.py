@@ -81,11 +81,11 @@ def _fits(hint: Any, value: object) -> bool:
         return any(_fits(option, value) for option in get_args(hint))
     if hint is float:
         return type(value) in (int, float)
+    if (get_origin(hint) or hint) in (list, tuple, set):  # JSON has lists alone
+        options = [option for option in get_args(hint) if option is not Ellipsis] or [Any]
+        return isinstance(value, list) and all(any(_fits(o, item) for o in options) for item in value)
     if hint in WORDS:
         return type(value) is hint
-    if get_origin(hint) in (list, tuple, set):
-        options = [option for option in get_args(hint) if option is not Ellipsis]
-        return isinstance(value, list) and all(any(_fits(o, item) for o in options) for item in value)
     if get_origin(hint) is dict:
         return isinstance(value, dict) and all(_fits(get_args(hint)[1], item) for item in value.values())
     return True  # draccus decodes the rest by its own rules

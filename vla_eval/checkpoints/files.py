@@ -171,7 +171,10 @@ def adapter_base(folder: Path) -> Path | None:
 
 
 def adapter_bases(folder: Path, *, base_checkpoint: str | None = None) -> list[Path]:
-    """Return the checkpoints below a LoRA adapter, nearest first; `base_checkpoint`: where its base lies."""
+    """Return the checkpoints below a LoRA adapter that are there, nearest first; none for a whole model.
+
+    `base_checkpoint`: where its base lies; None: where it was in training. None may be its own base.
+    """
     if not (folder / ADAPTER_CONFIG_FILE).is_file():
         return []
     chain = [folder]

@@ -55,6 +55,10 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
     Returns:
         `checkpoints/POLICY`, `checkpoints/POLICY/base`, `datasets/NAME` -> sha256; empty for a policy
         without weights, or whose adapter is another package's.
+
+    Raises:
+        CheckpointError: the weights are not there.
+        RecipeError: an argument that names a folder is not text.
     """
     for name in ("checkpoint", "base_checkpoint"):
         if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):

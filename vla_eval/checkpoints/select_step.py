@@ -21,7 +21,7 @@ class Step(NamedTuple):
 
 
 def select_step(policy: Any, batch: dict[str, Any], queues: Mapping[str, Any] | None) -> Step:
-    """Return the next action for the newest frame (B, …); None as `queues`: the episode begins."""
+    """Return the next action for the newest frame (B, …); `queues` stay as they are; None: it begins."""
     owner = policy.select_action.__self__  # of a policy with a LoRA adapter, not what is around it
     for name, value in (queues or {}).items():
         setattr(owner, name, copy.deepcopy(value))

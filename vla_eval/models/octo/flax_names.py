@@ -49,10 +49,6 @@ def _heads_in(x: Tensor) -> Tensor:
     return x.flatten(0, 1).T  # (heads, head, out) -> (out, heads × head)
 
 
-def _flat(x: Tensor) -> Tensor:
-    return x.flatten()
-
-
 def _linear(pattern: str, name: str) -> list[_Rule]:
     return [
         _Rule(pattern + r"\.kernel", f"{name}.weight", _dense),
@@ -90,7 +86,7 @@ _RULES: tuple[_Rule, ...] = (
         for part in ("query", "key", "value")
         for rule in (
             _Rule(ATTENTION + rf"{part}\.kernel", f"{_BLOCKS}.{part}.weight", _heads_out),
-            _Rule(ATTENTION + rf"{part}\.bias", f"{_BLOCKS}.{part}.bias", _flat),
+            _Rule(ATTENTION + rf"{part}\.bias", f"{_BLOCKS}.{part}.bias", torch.flatten),
         )
     ),
     _Rule(ATTENTION + r"out\.kernel", f"{_BLOCKS}.out.weight", _heads_in),

@@ -98,17 +98,14 @@ class SentenceWatch:
             pair = frozenset((other.sentence, reading.sentence))
             if len(pair) == 2 and pair not in self._said and not own & self._tasks[other.sentence]:
                 self._said.add(pair)
-                said.append(self._same(other, reading))
+                # By their sentences: which of them a worker reads first is chance.
+                one, two = sorted((other, reading), key=lambda one: one.sentence)
+                said.append(
+                    f"policy '{self._policy}' reads one and the same of two tasks, {self._named(one)} and "
+                    f"{self._named(two)}: {quoted(one.kept)}. It can distinguish them by what it sees alone. "
+                    "Use sentences that differ in what is read."
+                )
         return said
-
-    def _same(self, *pair: SentenceReading) -> str:
-        # By their sentences: which of them a worker reads first is chance.
-        one, other = sorted(pair, key=lambda reading: reading.sentence)
-        return (
-            f"policy '{self._policy}' reads one and the same of two tasks, {self._named(one)} and "
-            f"{self._named(other)}: {quoted(one.kept)}. It can distinguish them by what it sees alone. Use "
-            "sentences that differ in what is read."
-        )
 
     def _named(self, one: SentenceReading) -> str:
         tasks = sorted(self._tasks[one.sentence] - {one.sentence})

@@ -99,7 +99,11 @@ class ChoicePolicy(_CandidateArm[CandidateExpert]):
 
 
 class VisitPolicy(_CandidateArm[VisitExpert]):
-    """Goes to several candidates: those shown, others drawn where it does not know them, or all of them."""
+    """Goes to several candidates: the right ones, as many drawn uniformly, or all of them.
+
+    An arm that knows none or only some of them knows how many were shown, and draws the others, and their
+    order.
+    """
 
     def _go(self, window: ObservationWindow, state: PrivilegedState) -> NDArray[np.float32]:
         wanted, in_order = self._itinerary(window.slot, state)

@@ -137,16 +137,14 @@ class LeRobotPolicy:
         self._n_slots = n_slots
         self._slots: dict[int, Episode] = {}
         self._readings = Readings()
+        reads_more = self._remembers or self._by_step or self._earlier is not None or len(self._deltas) > 1
         self.spec = PolicySpec(
             name=name,
-            reads="every" if self._sees_every_frame() else "last",
+            reads="every" if reads_more else "last",
             cameras=tuple(inputs.cameras),
             states=PROPRIO_STATES if inputs.state is not None else (),
             chunk_size=chunk_size(loaded.config),
         )
-
-    def _sees_every_frame(self) -> bool:
-        return self._remembers or self._by_step or self._earlier is not None or len(self._deltas) > 1
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Begin these episodes; nothing of their slots' earlier ones is kept."""
@@ -213,21 +211,18 @@ class LeRobotPolicy:
             batch = self._loaded.preprocessor(batch_of(frames, rows))
             if self._by_step:
                 (episode,) = rows
-                self._check_shown(episode)
+                if len(episode.unseen) != 1:
+                    raise InvalidActionError(
+                        f"policy '{self.spec.name}' (type '{config.type}') is asked for one action at each "
+                        f"control step; expected one new frame, found {len(episode.unseen)}. Ask it with "
+                        "n_action_steps 1."
+                    )
                 raw, *memories = select_step(policy, batch, episode.memory)
             else:
                 raw = policy.predict_action_chunk(batch, **extra)
             actions = self._loaded.postprocessor(raw)
         chunks = self._chunks(actions, len(rows))
         return [_Inferred(*one) for one in zip(chunks, memories, strict=True)]
-
-    def _check_shown(self, episode: Episode) -> None:
-        if len(episode.unseen) != 1:
-            raise InvalidActionError(
-                f"policy '{self.spec.name}' (type '{self._loaded.config.type}') is asked for one action at "
-                f"each control step; expected one new frame, found {len(episode.unseen)}. Ask it with "
-                "n_action_steps 1."
-            )
 
     def _recall(self, rows: Sequence[Episode]) -> tuple[Any, list[Any]]:
         """Return what the policy remembers now: of all rows, as it takes it, and of each."""
