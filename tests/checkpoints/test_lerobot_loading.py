@@ -29,7 +29,6 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import CheckpointError
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.models.families import FAMILIES
-from vla_eval.policies.entries import load_policy_entries
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.run_folder import read_run
@@ -259,7 +258,7 @@ class TestFolders:
             config = EvalConfig(
                 name="c", tasks=(TASK,), policies=tuple(str(tmp_path / name) for name in names)
             )
-            return plan_shard(config, None, load_policy_entries(config.policies)).recipe_hashes
+            return plan_shard(config, None).recipe_hashes
 
         both = noted("one", "two")
         assert both[f"datasets/{FACTS.dataset}"] == digests["one"]

@@ -60,7 +60,8 @@ class TestRecipe:
             ({"episodes": 0}, "episodes is 0, expected a number ≥ 1"),
             ({"action_noise": -0.1}, "action_noise is -0.1, expected a number ≥ 0"),
             ({"tasks": [TASK, TASK]}, "none of them twice"),
-            ({"encoder": {"g": 0}}, "expected crf ≥ 0 and g ≥ 1"),
+            ({"encoder": {"g": 0}}, "encoder.g is 0, expected a number ≥ 1"),
+            ({"encoder": {"crf": -1}}, "encoder.crf is -1, expected a number ≥ 0"),
             ({"state": "eff"}, "'eef' or 'joints'"),
         ],
     )
