@@ -157,12 +157,13 @@ def run(args: argparse.Namespace) -> int:
         captured = (shared_folder(args.out or RUNS_FOLDER),) if config.capture.is_on else ()
         return (*needed_files(policies), *captured)
 
-    with backend_of(args, needs=needs) as backend, stop_on_signals() as stop:
+    with backend_of(args, needs=needs) as backend:
         out = shard_folder(args.out, args.shard) if args.out else None
         resolved = ResolvedEvaluation.of(config, policies, backend=backend, out=out, shard=args.shard)
         if args.dry_run:
             return _dry_run(resolved, args)
-        summary = evaluate_one(resolved, args, stop=stop)
+        with stop_on_signals() as stop:
+            summary = evaluate_one(resolved, args, stop=stop)
     out = resolved.out
     if summary.was_stopped:
         n_done = summary.n_episodes - summary.n_open
