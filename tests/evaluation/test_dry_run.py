@@ -108,6 +108,13 @@ def test_the_command_prints_what_would_run(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_run_that_was_killed_before_its_first_episode_has_all_of_them_to_run(tmp_path: Path) -> None:
+    evaluate(config(), out=tmp_path / "run")
+    (tmp_path / "run" / "episodes.jsonl").unlink()
+    effort = evaluation_effort(config(), out=tmp_path / "run")
+    assert (effort.n_episodes, effort.n_finished) == (8, 0)
+
+
 class TestRefusals:
     """Whatever `evaluate` refuses before its first episode, the dry run refuses in the same words."""
 

@@ -27,6 +27,7 @@ from vla_eval.storage.folders import (
     check_folder,
     not_a_run_folder,
 )
+from vla_eval.storage.planned import PlannedEpisodes
 from vla_eval.storage.run_file import (
     DEVICE,
     RUN_FILE,
@@ -248,17 +249,20 @@ def read_run(path: Path) -> StoredRun:
     """
     try:
         run_file = RunFile.load(path)
-        data = read_lines(path / EPISODES_FILE)
     except (FileNotFoundError, NotADirectoryError) as exc:
         raise not_a_run_folder(path) from exc
-    # What follows the last newline is being written at this moment, or was when its writer was killed.
-    records = parse_records(data[: data.rfind(b"\n") + 1], path / EPISODES_FILE, run_file.planned(path))
     return StoredRun(
         path=path,
         description=run_file.description,
-        records=tuple(records.values()),
+        records=_whole_records(path, run_file.planned(path)),
         sessions=run_file.sessions,
     )
+
+
+def _whole_records(path: Path, planned: PlannedEpisodes) -> tuple[EpisodeRecord, ...]:
+    data = read_lines(path / EPISODES_FILE)
+    # What follows the last newline is being written at this moment, or was when its writer was killed.
+    return tuple(parse_records(data[: data.rfind(b"\n") + 1], path / EPISODES_FILE, planned).values())
 
 
 def check_startable(
@@ -280,8 +284,4 @@ def check_startable(
     run_file = continued(
         path, description, shown=path, allow_environment_change=allow_environment_change, may_grow=True
     )
-    planned = run_file.planned(path, groups)
-    if not (path / RUN_FILE).is_file():
-        return ()
-    data = read_lines(path / EPISODES_FILE)
-    return tuple(parse_records(data[: data.rfind(b"\n") + 1], path / EPISODES_FILE, planned).values())
+    return _whole_records(path, run_file.planned(path, groups))
