@@ -148,9 +148,9 @@ def small_act() -> Iterator[None]:
 def small_act_in_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """The same in worker processes, which have to import lerobot for it."""
     from vla_eval.evaluation import evaluate
-    from vla_eval.testing.tiny_models import tiny_worker_main
+    from vla_eval.testing.tiny_models import TINY_RUNNER
 
-    monkeypatch.setattr(evaluate, "worker_main", tiny_worker_main)
+    monkeypatch.setattr(evaluate, "RUNNER", TINY_RUNNER)
 
 
 @pytest.fixture

@@ -32,7 +32,7 @@ from vla_eval.models.families import FAMILIES
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.run_folder import read_run
-from vla_eval.testing.tiny_models import make_tiny, tiny_paligemma, tiny_worker_main
+from vla_eval.testing.tiny_models import TINY_RUNNER, make_tiny, tiny_paligemma
 
 pytestmark = pytest.mark.usefixtures("no_network")
 backbone, env = small_checkpoints.backbone, small_checkpoints.env
@@ -223,7 +223,7 @@ class TestFolders:
         self, act: Path, backbone: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         if backbone == "small":
-            monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
+            monkeypatch.setattr(evaluate_module, "RUNNER", TINY_RUNNER)
         folder = tmp_path / "mine"
         folder.mkdir()
         copied(act, folder)

@@ -69,7 +69,7 @@ class TestToyFamily:
         assert main(["checkpoint", "verify", str(run)]) == 0
         assert "mikasa_toy" in capsys.readouterr().out
 
-        monkeypatch.setattr(evaluate_module, "worker_main", toy.toy_worker_main)
+        monkeypatch.setattr(evaluate_module, "RUNNER", f"{toy.__name__}:toy_runner")
         out = tmp_path / "evaluation"
         evaluation = ["eval", "--task", "RememberColor3-v0", "--policy", str(run), "--workers", "1"]
         evaluation += ["--episodes", "2", "--set", "simulator=fake", "--set", "env.horizon_steps=6"]

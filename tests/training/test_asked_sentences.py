@@ -27,7 +27,7 @@ from vla_eval.errors import SpecMismatchError
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.serving.server import ServerOptions
-from vla_eval.testing.tiny_models import tiny_paligemma, tiny_worker_main
+from vla_eval.testing.tiny_models import TINY_RUNNER, tiny_paligemma
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
 
@@ -265,7 +265,7 @@ class TestCutSentences:
             finetune={**config.finetune, "policy": policy, "batch_size": 16},
             held_out=dataclasses.replace(HELD_OUT, env={"horizon_steps": 6}, workers=1, task=TASK),
         )
-        monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
+        monkeypatch.setattr(evaluate_module, "RUNNER", TINY_RUNNER)
         lines: list[str] = []
         with tiny_paligemma("pi0"):
             finetune(config, say=lines.append)

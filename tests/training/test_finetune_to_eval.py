@@ -13,8 +13,8 @@ from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.storage.run_folder import read_run
 from vla_eval.testing.tiny_models import (
     TINY_POLICY,
+    TINY_RUNNER,
     tiny_paligemma,
-    tiny_worker_main,
     write_tiny_smolvlm,
     write_tiny_tokenizer,
 )
@@ -67,7 +67,7 @@ def test_tiny_pi0_pi05_and_smolvla_go_from_a_dataset_to_a_table_in_worker_proces
             assert code == 0
             assert Path(capsys.readouterr().out.strip()) == find_checkpoint(runs[family])
 
-    monkeypatch.setattr(evaluate_module, "worker_main", tiny_worker_main)
+    monkeypatch.setattr(evaluate_module, "RUNNER", TINY_RUNNER)
     out = tmp_path / "evaluation"
     policies = ["--policy", *map(str, runs.values())]
     # 1001 is a seed of the demonstrations, 1002 is not: the expert failed there.

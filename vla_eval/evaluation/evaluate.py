@@ -6,7 +6,6 @@ means, the same call resumes where it stopped.
 """
 
 import contextlib
-import functools
 import logging
 import time
 from collections.abc import Collection, Mapping
@@ -22,7 +21,7 @@ from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.evaluation.server_phases import ReadyPhase, phases, with_servers
-from vla_eval.evaluation.worker import Finished, SentenceRead, worker_main
+from vla_eval.evaluation.worker import Finished, SentenceRead
 from vla_eval.models.shared.sentence_reading import SentenceWatch
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
@@ -31,13 +30,15 @@ from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_folder import RunDescription, RunFolder, StoredEpisode
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.backend import Pool
+from vla_eval.workers.inside import RunnerClass
 from vla_eval.workers.jobs import Answered
 from vla_eval.workers.load import Load
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
-from vla_eval.workers.process import WorkerMain, WorkerSpec
+from vla_eval.workers.process import WorkerSpec
 from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.evaluation.worker"
+RUNNER = f"{WORKER_MODULE}:EpisodeRunner"
 LOAD_SECONDS = 1.0  # between two calls of `on_load`
 MAX_SERVER_STARTS = 3  # of one policy, so that one that always dies ends in errors
 EpisodePool = Pool[EpisodeBatch, Finished]
@@ -165,7 +166,7 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
     logs, resolved = bookkeeper.path / "logs", bookkeeper.resolved
     logs.mkdir(exist_ok=True)
     spec = WorkerSpec(
-        main=_worker_main(bookkeeper),
+        runner=_runner(bookkeeper),
         answers=(Finished,),
         timeouts=resolved.config.timeouts,
         logs=logs,
@@ -190,13 +191,13 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
     return False
 
 
-def _worker_main(bookkeeper: "_Bookkeeper") -> WorkerMain:
+def _runner(bookkeeper: "_Bookkeeper") -> RunnerClass:
     config = bookkeeper.resolved.config
-    if not config.capture.is_on:
-        return worker_main
-    folder = bookkeeper.path.resolve()
-    capture = EpisodeCapture(config=config.capture, folder=folder, seed_start=config.seed_start)
-    return functools.partial(worker_main, capture=capture)
+    capture = None
+    if config.capture.is_on:
+        folder = bookkeeper.path.resolve()
+        capture = EpisodeCapture(config=config.capture, folder=folder, seed_start=config.seed_start)
+    return RunnerClass(target=RUNNER, options={"capture": capture})
 
 
 def _run(

@@ -11,8 +11,6 @@ import gc
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
-from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.config.environment import EnvSettings
@@ -36,8 +34,7 @@ from vla_eval.seeding import seed_global_generators
 from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.viz.capture import EpisodeCapture
-from vla_eval.workers.framing import send_message
-from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.inside import Heartbeat
 from vla_eval.workers.messages import DeviceFound, Failed, Notice, describe_error
 
 logger = logging.getLogger(__name__)
@@ -221,15 +218,3 @@ def make_policy(group: EpisodeGroup, facts: EnvFacts) -> Policy:
         n_slots=group.env.n_slots,
     )
     return make_from_adapter(group.adapter, context, group.args)
-
-
-def worker_main(
-    connection: Connection,
-    shared: SharedStage,
-    log: Path,
-    capture: EpisodeCapture | None = None,
-) -> None:
-    """Run episodes for the parent until it has no more; the entry point of the worker process."""
-    detach(log)
-    tell = functools.partial(send_message, connection)
-    serve(connection, EpisodeRunner(Heartbeat(shared), tell, capture))

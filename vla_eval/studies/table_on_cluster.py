@@ -8,12 +8,14 @@ from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.errors import FolderInUseError, TrainingError
 from vla_eval.evaluation.model_table import Finetuning
 from vla_eval.strict.bounds import MAX_SECONDS
-from vla_eval.training.finetune_jobs import Finetuned, FinetuneJob, finetune_main
+from vla_eval.training.finetune_jobs import RUNNER, Finetuned, FinetuneJob
 from vla_eval.workers.backend import Backend, Pool
+from vla_eval.workers.inside import RunnerClass
 from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.messages import Failed
 from vla_eval.workers.process import WorkerSpec
 
+TINY_RUNNER = "vla_eval.testing.tiny_models:tiny_finetune_runner"
 MAX_TRIES = 2  # of one fine-tuning, since a machine may hiccup; each resumes from its last checkpoint
 
 
@@ -35,14 +37,10 @@ def finetune_on(
         TrainingError: one of them failed, after the others were finished; the message names all.
     """
     logs.mkdir(parents=True, exist_ok=True)
-    main = finetune_main
-    if is_tiny:
-        from vla_eval.testing.tiny_models import tiny_finetune_main
-
-        main = tiny_finetune_main
     jobs = [FinetuneJob(config=one.config, command=command, name=one.name) for one in todo]
     timeouts = TimeoutConfig(setup_seconds=MAX_SECONDS)
-    spec = WorkerSpec(main=main, answers=(Finetuned,), timeouts=timeouts, logs=logs)
+    runner = RunnerClass(target=TINY_RUNNER if is_tiny else RUNNER)
+    spec = WorkerSpec(runner=runner, answers=(Finetuned,), timeouts=timeouts, logs=logs)
     size = max(1, min(len(jobs), backend.n_gpus or backend.n_cores))
     pool: Pool[FinetuneJob, Finetuned] = backend.pool(spec, size=size, takes_gpu=True)
     failed = _run(pool, JobList(jobs), n_jobs=len(jobs), say=say, is_stopping=is_stopping)

@@ -7,21 +7,22 @@ is being made. Nothing on disk is changed. The results of such a model say nothi
 import contextlib
 import importlib
 import json
-from collections.abc import Iterator, Mapping
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple  # lerobot and transformers are untyped
 from unittest.mock import patch
 
 from vla_eval.checkpoints.files import CONFIG_FILE, find_checkpoint, read_json
-from vla_eval.evaluation.worker import worker_main
+from vla_eval.evaluation.worker import EpisodeRunner
 from vla_eval.models.families import FAMILIES, TINY_POLICY, family_of
 from vla_eval.models.family import imported
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
-from vla_eval.training.finetune_jobs import finetune_main
-from vla_eval.workers.inside import SharedStage
+from vla_eval.training.worker import FinetuneRunner
+from vla_eval.workers.inside import Heartbeat, Runner
+from vla_eval.workers.messages import Notice
 
+TINY_RUNNER = f"{__name__}:tiny_episode_runner"
 VOCABULARY = 512
 CORPUS = ("remember the color and touch it", "push the cube to the goal", "which cup hides the ball")
 SPECIAL_TOKENS = ("<pad>", "<eos>", "<bos>", "<unk>")
@@ -190,13 +191,17 @@ def tiny_forms() -> Iterator[None]:
         yield
 
 
-def tiny_worker_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Run a worker of an evaluation in which they are tiny, and ACT is; see `worker_main`."""
-    with tiny_forms(), tiny_resnet():
-        worker_main(connection, shared, log)
+_for_good = contextlib.ExitStack()  # in workers: it ends with the process
 
 
-def tiny_finetune_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Run a worker that fine-tunes, in which they are tiny; see `finetune_main`."""
-    with tiny_forms():
-        finetune_main(connection, shared, log)
+def tiny_episode_runner(heartbeat: Heartbeat, tell: Callable[[Notice], None], **options: Any) -> Runner:
+    """Make the runner of an evaluation's worker in which they are tiny, and ACT is; see `RunnerClass`."""
+    _for_good.enter_context(tiny_forms())
+    _for_good.enter_context(tiny_resnet())
+    return EpisodeRunner(heartbeat, tell, **options)
+
+
+def tiny_finetune_runner(heartbeat: Heartbeat, tell: Callable[[Notice], None]) -> Runner:
+    """Make the runner of a worker that fine-tunes, in which they are tiny; see `RunnerClass`."""
+    _for_good.enter_context(tiny_forms())
+    return FinetuneRunner(heartbeat, tell)

@@ -2,12 +2,13 @@
 
 import functools
 import logging
+from collections.abc import Callable
 
 from vla_eval.errors import VlaEvalError
 from vla_eval.training.finetune import finetune
 from vla_eval.training.finetune_jobs import Finetuned, FinetuneJob
 from vla_eval.workers.inside import Heartbeat
-from vla_eval.workers.messages import Failed, describe_error
+from vla_eval.workers.messages import Failed, Notice, describe_error
 
 logger = logging.getLogger(__name__)
 
@@ -15,7 +16,7 @@ logger = logging.getLogger(__name__)
 class FinetuneRunner:
     """Does one fine-tuning after the other."""
 
-    def __init__(self, heartbeat: Heartbeat) -> None:
+    def __init__(self, heartbeat: Heartbeat, _tell: Callable[[Notice], None]) -> None:
         """Start with nothing made."""
         self._heartbeat = heartbeat
 

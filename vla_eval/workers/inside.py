@@ -5,12 +5,15 @@ Knows nothing of what a job is; that is the `Runner`'s.
 
 import ctypes
 import faulthandler
+import functools
+import importlib
 import logging
 import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Protocol, TextIO, cast
@@ -19,6 +22,7 @@ from vla_eval.core import Stage
 from vla_eval.plain_text import PlainStream
 from vla_eval.records import EpisodeKey, EpisodeTiming
 from vla_eval.workers.framing import send_message
+from vla_eval.workers.messages import Notice
 
 logger = logging.getLogger(__name__)
 
@@ -100,6 +104,31 @@ class Runner(Protocol):
 
     def close(self) -> None:
         """Release the simulator."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RunnerClass:
+    """The class of a runner, by its name: the parent need not import what only a worker needs.
+
+    Attributes:
+        target: `module:Class`, or a function that makes one; called with a heartbeat, a function that sends
+            the parent a `Notice`, and `options`.
+    """
+
+    target: str
+    options: Mapping[str, Any] = field(default_factory=dict)  # Any: whatever it takes
+
+    def make(self, heartbeat: Heartbeat, tell: Callable[[Notice], None]) -> Runner:
+        """Import the class and make one."""
+        module, _, name = self.target.partition(":")
+        made: Runner = getattr(importlib.import_module(module), name)(heartbeat, tell, **self.options)
+        return made
+
+
+def worker_main(runner: RunnerClass, connection: Connection, shared: SharedStage, log: Path) -> None:
+    """Answer the parent's jobs until it has no more; the entry point of a worker process."""
+    detach(log)
+    serve(connection, runner.make(Heartbeat(shared), functools.partial(send_message, connection)))
 
 
 def serve(connection: Connection, runner: Runner) -> None:

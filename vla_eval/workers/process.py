@@ -5,6 +5,7 @@ job to a process that does not read, waiting for the previous process.
 """
 
 import contextlib
+import functools
 import logging
 import os
 import threading
@@ -19,9 +20,15 @@ from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.core import Stage
 from vla_eval.workers.framing import BrokenMessageError, Inbox
 from vla_eval.workers.guard import ASK_WHERE, END, REAP_SECONDS
-from vla_eval.workers.inside import SHARED_SIZE, STAGES, SharedStage, write_stage
+from vla_eval.workers.inside import SHARED_SIZE, STAGES, RunnerClass, SharedStage, worker_main, write_stage
 from vla_eval.workers.messages import MAX_DETAILS
-from vla_eval.workers.start import begin, end_server, start_by_lasting_thread, worker_environment
+from vla_eval.workers.start import (
+    PROCESS_NAME,
+    begin,
+    end_server,
+    start_by_lasting_thread,
+    worker_environment,
+)
 
 CLOSE_SECONDS = 5.0  # for closing a simulator; then it is killed
 END_SECONDS = REAP_SECONDS + 1  # the guard gives up earlier
@@ -36,18 +43,23 @@ class WorkerSpec:
     """What the workers of a pool are made of, wherever they run.
 
     Attributes:
-        main: what a process runs: it answers each job `J` by an `A` or a `Failed`.
+        runner: what answers each job `J` by an `A` or a `Failed`.
         answers: the classes of `A`; anything else that a worker sends is an error.
         timeouts: how long a worker may be busy with one thing.
         logs: folder for what workers of this machine write to standard output and error.
         preload: modules that they need and that take long to import; see `worker_context`.
     """
 
-    main: WorkerMain
+    runner: RunnerClass
     answers: tuple[type, ...]
     timeouts: TimeoutConfig
     logs: Path
     preload: tuple[str, ...] = ()
+
+    @property
+    def main(self) -> WorkerMain:
+        """What a process runs."""
+        return functools.partial(worker_main, self.runner)
 
 
 logger = logging.getLogger(__name__)
@@ -223,7 +235,7 @@ class WorkerProcess:
                 return
             own = (self._their_lifeline, self._main, self._their_connection, self._shared, self.log)
             process = self._context.Process(
-                target=begin, args=(environment, *own), name=f"mikasa-vla worker {self.index}"
+                target=begin, args=(environment, *own), name=f"{PROCESS_NAME} worker {self.index}"
             )
             self.is_starting = True
             try:

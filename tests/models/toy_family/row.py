@@ -1,12 +1,13 @@
 """A family as a contributor adds it: this folder, the row below, and a recipe (in the test)."""
 
-from multiprocessing.connection import Connection
-from pathlib import Path
+from collections.abc import Callable
+from typing import Any
 
-from vla_eval.evaluation.worker import worker_main
+from vla_eval.evaluation.worker import EpisodeRunner
 from vla_eval.models.families import FAMILIES
 from vla_eval.models.family import Base, Family, Source, Tiny
-from vla_eval.workers.inside import SharedStage
+from vla_eval.workers.inside import Heartbeat
+from vla_eval.workers.messages import Notice
 
 ROW = Family(
     type="mikasa_toy",
@@ -31,7 +32,7 @@ ROW = Family(
 )
 
 
-def toy_worker_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Run a worker that knows the row; see `worker_main`."""
+def toy_runner(heartbeat: Heartbeat, tell: Callable[[Notice], None], **options: Any) -> EpisodeRunner:
+    """Make the runner of a worker that knows the row; see `RunnerClass`."""
     FAMILIES[ROW.type] = ROW
-    worker_main(connection, shared, log)
+    return EpisodeRunner(heartbeat, tell, **options)

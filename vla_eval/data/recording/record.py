@@ -6,12 +6,10 @@ number of workers.
 """
 
 import functools
-import importlib
 import time
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal, Protocol, Self
 
@@ -39,8 +37,7 @@ from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_file import RunDescription
 from vla_eval.storage.shard import Shard
 from vla_eval.workers.backend import Backend, Pool
-from vla_eval.workers.framing import send_message
-from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.inside import RunnerClass
 from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
@@ -127,14 +124,6 @@ class RecordingSummary:
     parts: tuple[RecordedPart, ...] = ()
 
 
-def recording_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Record for the parent until it closes the pipe; the entry point of a worker process."""
-    detach(log)
-    # Imported by the worker alone: importing lerobot would delay the parent's message about a mistake by 5 s.
-    runner = importlib.import_module(WORKER_MODULE).RecordingRunner
-    serve(connection, runner(Heartbeat(shared), functools.partial(send_message, connection)))
-
-
 class _Stopped(Exception):
     """The observer asked to stop."""
 
@@ -184,7 +173,7 @@ def record(
     n_workers = backend.n_cores if recipe.workers == "auto" else recipe.workers
     with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
         spec = WorkerSpec(
-            main=recording_main,
+            runner=RunnerClass(target=f"{WORKER_MODULE}:RecordingRunner"),
             answers=(Attempt, ShardWritten, DatasetWritten),
             timeouts=recipe.timeouts,
             logs=folder.logs(),

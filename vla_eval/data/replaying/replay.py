@@ -5,11 +5,8 @@ was recorded, its actions would no longer lead to its states and to success. The
 the dataset, so that training can refuse one that fails.
 """
 
-import functools
-import importlib
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal
 
@@ -34,8 +31,7 @@ from vla_eval.storage.provenance import collect_environment
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.backend import Backend, Pool
-from vla_eval.workers.framing import send_message
-from vla_eval.workers.inside import Heartbeat, SharedStage, detach, serve
+from vla_eval.workers.inside import RunnerClass
 from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
@@ -76,13 +72,6 @@ class EpisodeReplayed:
     episode_index: int
     mismatches: tuple[str, ...]
     psnr_db: dict[str, float]
-
-
-def replay_main(connection: Connection, shared: SharedStage, log: Path) -> None:
-    """Replay for the parent until it closes the pipe; the entry point of a worker process."""
-    detach(log)
-    runner = importlib.import_module(WORKER_MODULE).ReplayRunner  # lerobot is imported by the worker alone
-    serve(connection, runner(Heartbeat(shared), functools.partial(send_message, connection)))
 
 
 def find_datasets(path: Path) -> tuple[Path, ...]:
@@ -133,7 +122,11 @@ def replay(
     replayed: list[EpisodeReplayed] = []
     preload = (WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ()))
     spec = WorkerSpec(
-        main=replay_main, answers=(EpisodeReplayed,), timeouts=TimeoutConfig(), logs=logs, preload=preload
+        runner=RunnerClass(target=f"{WORKER_MODULE}:ReplayRunner"),
+        answers=(EpisodeReplayed,),
+        timeouts=TimeoutConfig(),
+        logs=logs,
+        preload=preload,
     )
     pool: Pool[ReplayJob, EpisodeReplayed] = backend.pool(spec, size=size)
     with pool as running:
