@@ -17,7 +17,7 @@ from vla_eval.workers.start import begin, simulator_modules, worker_context, wor
 PARENT = """
 import os, sys, time
 from vla_eval.workers.start import begin, worker_context, worker_environment
-code = "from pathlib import Path; import os, time, vla_eval.evaluation.worker as inside;"
+code = "from pathlib import Path; import os, time, vla_eval.workers.inside as inside;"
 code += "inside.detach(Path(os.devnull)); there.send(os.getpid()); time.sleep(600)"
 context = worker_context()
 here, there = context.Pipe()
@@ -113,3 +113,22 @@ def test_a_guard_sleeps_while_its_worker_works() -> None:
     lifeline.close()
     process.join(60)
     assert process.exitcode == 0
+
+
+def test_a_script_without_a_main_guard_is_not_run_again(tmp_path: Path) -> None:
+    script = tmp_path / "script.py"
+    script.write_text(
+        f"""from pathlib import Path
+Path({str(tmp_path / "runs")!r}).open("a").write("x")
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.evaluation.evaluate import evaluate
+from vla_eval.evaluation.resolve import resolve
+config = EvalConfig(
+    name="x", tasks=("RememberColor3-v0",), policies=("hold",), episodes=2, workers=2, simulator="fake"
+)
+print(evaluate(resolve(config, out=Path({str(tmp_path / "out")!r}))).n_open)
+"""
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, timeout=300, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "0\n", "")
+    assert (tmp_path / "runs").read_text() == "x"

@@ -14,7 +14,7 @@ import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from multiprocessing import forkserver, resource_tracker
+from multiprocessing import forkserver, resource_tracker, spawn
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext, SpawnProcess
 from typing import Any  # private parts of multiprocessing
@@ -27,6 +27,8 @@ from vla_eval.workers.guard import end_with_parent, fork_guarded
 from vla_eval.workers.server import IMPORTS_VARIABLE, PARENT_VARIABLE
 
 SERVER_MODULE = "vla_eval.workers.server"
+PROCESS_NAME = "mikasa-vla"
+"""How the names of our processes begin."""
 
 NEAR_VARIABLE = "MIKASA_VLA_NEAR"
 """Environment variable of a cluster's workers: the address of their machine; servers there are preferred."""
@@ -41,6 +43,22 @@ _preloaded: dict[str, None] = {}
 _environment_lock = threading.Lock()  # several workers may be starting at once
 _starts: "queue.SimpleQueue[tuple[Future[None], Callable[[], None]]]" = queue.SimpleQueue()
 _starter: threading.Thread | None = None
+
+_preparation: Callable[[str], dict[str, Any]] = spawn.get_preparation_data
+
+
+def _without_script(name: str) -> dict[str, Any]:
+    """Return what multiprocessing tells a new process; ours do not run the user's script again.
+
+    multiprocessing would, and has no option against it: a script without a main guard would start over.
+    """
+    told = _preparation(name)
+    if name.startswith(PROCESS_NAME):
+        return {key: value for key, value in told.items() if not key.startswith("init_main_from")}
+    return told
+
+
+spawn.get_preparation_data = _without_script
 
 
 def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnContext:
@@ -125,6 +143,10 @@ def _server_pid() -> int | None:
 
 class _BoundProcess(SpawnProcess):
     """Bound to its parent before it imports what it is to run, which takes seconds."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:  # multiprocessing's own
+        super().__init__(*args, **kwargs)
+        self.name = f"{PROCESS_NAME} {self.name}"
 
     def __reduce__(self) -> tuple[Callable[[int], "_BoundProcess"], tuple[int], dict[str, Any]]:
         return _arrive, (os.getpid(),), self.__dict__
