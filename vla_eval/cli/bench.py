@@ -1,8 +1,10 @@
 """`mikasa-vla bench`: rendering, loading, and a policy behind a socket, as ratios from one run."""
 
 import argparse
+import shutil
 from pathlib import Path
 
+from vla_eval.errors import MissingDependencyError
 from vla_eval.strict.bounds import MAX_STEPS, check_bounds
 
 SYNTHETIC = "synthetic"
@@ -80,11 +82,34 @@ def run(args: argparse.Namespace) -> int:
         "baseline_episodes": (2, MAX_MEASURED_EPISODES),
     }
     check_bounds(args, bounds, prefix="bench: ")
+    _look_for(args)
     if args.serve is not None:
         return _serving(args)
     if args.against_official is not None:
         return _official(args)
     return _loader(args) if args.loader else _rendering(args)
+
+
+def _look_for(args: argparse.Namespace) -> None:
+    """Look for what is named, before torch or a simulator is loaded.
+
+    Raises:
+        VlaEvalError: there is no such task, policy, dataset or interpreter.
+    """
+    from vla_eval.data.info_file import require_folder
+    from vla_eval.policies.recipe import load_policy_recipe
+    from vla_eval.tasks.catalog import task_spec
+
+    task_spec(args.task)
+    if args.serve:
+        load_policy_recipe(args.serve)
+    if args.against_official and shutil.which(args.against_official) is None:
+        raise MissingDependencyError(
+            f"bench: expected a Python interpreter that has mikasa-robo-suite at {args.against_official}, "
+            "found none. docs/speed.md says how to install it."
+        )
+    if args.loader not in (None, SYNTHETIC):
+        require_folder(Path(args.loader))
 
 
 def _loader(args: argparse.Namespace) -> int:

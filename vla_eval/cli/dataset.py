@@ -99,7 +99,20 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the action."""
+    """Do the action; what it reads is looked for first, before torch is loaded.
+
+    Raises:
+        VlaEvalError: an unknown task, no such folder, or what the action raises.
+    """
+    from vla_eval.data.info_file import require_folder
+    from vla_eval.tasks.catalog import task_spec
+
+    if getattr(args, "task", None) is not None:
+        task_spec(args.task)
+    read = {"convert": "source", "mix": "datasets", "pull": None}.get(args.action, "dataset")
+    named = [] if read is None else getattr(args, read)
+    for folder in named if isinstance(named, list) else [named]:
+        require_folder(folder)
     return _ACTIONS[args.action](args)
 
 
@@ -243,10 +256,7 @@ def _check_leak(args: argparse.Namespace) -> int:
     from vla_eval.data.sharing.initial_states import read_initial_states
     from vla_eval.data.sharing.leak import check_leak
     from vla_eval.results.printed_table import markdown_table
-    from vla_eval.tasks.catalog import task_spec
 
-    if args.task is not None:
-        task_spec(args.task)  # a mistyped name must not wait for the dataset
     dataset = read_initial_states(args.dataset)
     task = args.task or dataset.task
     if task is None:

@@ -104,17 +104,18 @@ def run(args: argparse.Namespace) -> int:
             "--cluster is for a table of learned policies, whose fine-tunings run side by side. One "
             "fine-tuning runs on this machine; on several GPUs by `accelerate launch` (docs/finetuning.md)."
         )
+    config, command = _config(args), typed_command()
+    # Here and not above: `mikasa-vla --help` need not wait for numpy.
+    from vla_eval.training.request import finished_run, look_for
+
+    look_for(config, is_dry=args.dry_run)
     if args.dry_run:
         from vla_eval.training.dry_run import describe_finetuning
 
         with contextlib.redirect_stdout(sys.stderr), dry_run_options(args) as options:
-            lines = describe_finetuning(_config(args), options)
+            lines = describe_finetuning(config, options)
         print("\n".join(lines))
         return 0
-    config, command = _config(args), typed_command()
-    # Here and not above: `mikasa-vla --help` need not wait for numpy.
-    from vla_eval.training.request import finished_run
-
     finished = finished_run(config)
     if finished is not None:
         print(finished, file=sys.stderr)
