@@ -4,6 +4,7 @@ import argparse
 import shutil
 from pathlib import Path
 
+from vla_eval.cli.shared.arguments import NUMBERS, task_argument
 from vla_eval.errors import MissingDependencyError
 from vla_eval.strict.bounds import MAX_STEPS, check_bounds
 
@@ -21,8 +22,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser = subparsers.add_parser(
         "bench", help="measure rendering, loading or serving, as ratios from one run"
     )
-    parser.add_argument("--task", default="RememberColor3-v0", help="task id (default: %(default)s)")
-    parser.add_argument("--n-action-steps", type=int, nargs="+", default=[1, 4, 8], metavar="K")
+    parser.add_argument(
+        "--task", type=task_argument, default="RememberColor3-v0", help="task id (default: %(default)s)"
+    )
+    parser.add_argument("--n-action-steps", **NUMBERS, default=[1, 4, 8], metavar="K")
     parser.add_argument("--repeats", type=int, default=2, help="the lowest of so many times counts")
     parser.add_argument("--wrist-mesh", choices=("shipped", "whole", "simplified"), default="shipped")
     parser.add_argument(
@@ -61,9 +64,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         metavar="POLICY",
         help="instead: a policy behind a socket against copies of it (a small transformer if none is named)",
     )
-    parser.add_argument(
-        "--sessions", type=int, nargs="+", default=[1, 4, 8, 16], metavar="N", help="with --serve"
-    )
+    parser.add_argument("--sessions", **NUMBERS, default=[1, 4, 8, 16], metavar="N", help="with --serve")
     parser.add_argument(
         "--seconds", type=float, default=10.0, help="of each rate, with --serve (default: %(default)s)"
     )

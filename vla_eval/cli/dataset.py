@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.shared.arguments import add_flags, seeds_argument
+from vla_eval.cli.shared.arguments import add_flags, seeds_argument, task_argument
 from vla_eval.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -37,7 +37,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         help="replay a recording, and write what the arm did in this control mode (env.control_mode)",
     )
     convert.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
-    convert.add_argument("--task", metavar="T", help="task id, for sources without an instruction")
+    convert.add_argument(
+        "--task", type=task_argument, metavar="T", help="task id, for sources without an instruction"
+    )
     convert.add_argument("--state", choices=("eef", "joints"), help="what observation.state is (eef)")
     convert.add_argument(
         "--image-size",
@@ -73,14 +75,14 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
     adopt = action("adopt", help="use a dataset that lerobot-edit-dataset has edited")
     adopt.add_argument("dataset", metavar="DIR", type=Path, help="a dataset with this project's fields")
-    adopt.add_argument("--task", metavar="T", help="task id of its demonstrations")
+    adopt.add_argument("--task", type=task_argument, metavar="T", help="task id of its demonstrations")
 
     leak = action(
         "check-leak",
         help="whether demonstrations begin as the evaluation's episodes do (exit code 1 if any does)",
     )
     leak.add_argument("dataset", metavar="DIR", type=Path, help="a dataset, or what `convert` reads")
-    leak.add_argument("--task", metavar="T", help="task id, for datasets that name none")
+    leak.add_argument("--task", type=task_argument, metavar="T", help="task id, for datasets that name none")
     leak.add_argument("--seeds", metavar="A-B", type=seeds_argument, help="seeds of the evaluation (1-100)")
 
     card = action("card", help="write README.md and a contact sheet")

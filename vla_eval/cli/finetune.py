@@ -14,6 +14,7 @@ from vla_eval.cli.shared.arguments import (
     positive_argument,
     read_config,
     set_flags,
+    task_argument,
     typed_command,
 )
 from vla_eval.config.files import apply_overrides
@@ -51,7 +52,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         metavar="NAME",
         help="recipe in policies/ with a `finetune` section; of a table: its rows",
     )
-    parser.add_argument("--task", nargs="+", dest="tasks", metavar="T", help="of a table: its tasks")
+    parser.add_argument(
+        "--task", nargs="+", type=task_argument, dest="tasks", metavar="T", help="of a table: its tasks"
+    )
     parser.add_argument("--dataset", metavar="DIR", help="folder of one dataset, or a folder that holds one")
     parser.add_argument("--steps", type=int, metavar="N", help="gradient steps (the recipe's)")
     parser.add_argument("--batch-size", type=int, metavar="B", help="samples per step (the recipe's)")
