@@ -35,6 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     verify.add_argument("path", metavar="PATH", help="a LeRobot checkpoint, or a run of ours")
     verify.add_argument("--device", default="cpu", metavar="D", help="auto, cpu, cuda (cpu)")
     verify.add_argument("--tokenizer", metavar="DIR", help="folder of the tokenizer")
+    verify.add_argument("--verbose", action="store_true", help="name each statistic, not only their fields")
     for module in (convert, fetch, merge, rehearse):
         module.add_parsers(actions)
 
@@ -85,4 +86,4 @@ def _verify(args: argparse.Namespace) -> list[str]:
     from vla_eval.policies.lerobot.device import choose_device
 
     options = LoadOptions(device=choose_device(args.device), tokenizer=args.tokenizer)
-    return verify_checkpoint(Path(args.path), options).lines()
+    return verify_checkpoint(Path(args.path), options).lines(verbose=args.verbose)
