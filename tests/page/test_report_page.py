@@ -9,23 +9,18 @@ from dataclasses import replace
 from functools import lru_cache
 from html.parser import HTMLParser
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import matplotlib
 import pytest
 
 from vla_eval.cli.main import main
 from vla_eval.errors import ReportError
-from vla_eval.page import machine_sections
 from vla_eval.page.build import build_page, with_code, write_page
 from vla_eval.page.charts import MARKERS, Bar, Chart, Curves, Point, Series, curves, forest, sign
 from vla_eval.page.rates import _round_ticks
 from vla_eval.page.svg import PALETTE
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.results.report import build_table, render
-from vla_eval.results.sweep import compare_runs
-from vla_eval.results.sweep_format import render_sweep
 from vla_eval.results.table_columns import lay_out
 from vla_eval.storage.capture_files import video_file
 from vla_eval.storage.run_folder import RunDescription, RunFolder, Session, StoredRun, read_run
@@ -403,28 +398,3 @@ def test_a_folder_whose_name_is_no_utf_8_is_shown_escaped(tmp_path: Path) -> Non
     run = replace(full_run(), path=Path(os.fsdecode(b"runs/\xfc")))
     page = write_page([run], tmp_path / "page").read_text(encoding="utf-8")
     assert "runs/\\udcfc" in page
-
-
-def test_latencies_are_in_the_order_of_policy_then_k(monkeypatch: pytest.MonkeyPatch) -> None:
-    measured = SimpleNamespace(median_seconds=1.0, slowest_seconds=1.0, n_episodes=1, episode_seconds=1.0)
-    monkeypatch.setattr(machine_sections, "measure_latency", lambda *_: measured)
-    records = [episode(policy, 1, True, k=k) for k in (8, 1, 16) for policy in ("mine", "oracle")]
-    run = SimpleNamespace(records=records, path=Path("runs/a"))
-    material: Any = SimpleNamespace(runs=[run], tasks=[COLOR], timings={"runs/a": None})
-
-    rows = machine_sections.latency(material).table.rows
-
-    assert [row[0] for row in rows] == [
-        *(f"mine · K={k}" for k in (1, 8, 16)),
-        *(f"oracle · K={k}" for k in (1, 8, 16)),
-    ]
-
-
-def test_a_wrong_choice_is_not_said_to_be_forgotten() -> None:
-    page = full_page()
-    assert "wrong choice" in page and ">forgot<" not in page
-
-
-def test_the_header_says_which_difference_the_episodes_settle() -> None:
-    sweep = compare_runs([full_run()], by="policy", difference=0.15)
-    assert "episodes to settle ±0.15" in render_sweep(sweep, "markdown")

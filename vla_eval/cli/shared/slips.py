@@ -1,4 +1,4 @@
-"""Flags and words that people type for others, and what they are told. Knows nothing of verbs' work."""
+"""Suggestions for flags and words that are often typed for others. Knows nothing of what verbs do."""
 
 import argparse
 from collections.abc import Collection, Iterable, Mapping, Sequence
