@@ -79,7 +79,7 @@ def _tasks() -> str:
         for name in specs:
             printed = io.StringIO()
             with contextlib.redirect_stdout(printed):
-                show.run(argparse.Namespace(task=name, prompt_set=DEFAULT_PROMPT_SET))
+                show.run(argparse.Namespace(name=name, prompt_set=DEFAULT_PROMPT_SET))
             lines += [f"### {name}", "", *_printed(printed.getvalue())]
     return "\n".join(lines)
 

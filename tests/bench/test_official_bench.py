@@ -13,7 +13,7 @@ from vla_eval.bench.official import (
     _official,
     run_official_bench,
 )
-from vla_eval.errors import ConformanceError, MissingDependencyError
+from vla_eval.errors import ConformanceError
 
 
 def program(path: Path, script: str) -> Path:
@@ -55,9 +55,7 @@ def test_the_first_episode_of_the_official_runner_counts_as_its_start(tmp_path: 
     assert found.per_second == 10
 
 
-def test_an_interpreter_that_is_not_there_or_fails_is_named(tmp_path: Path) -> None:
-    with pytest.raises(MissingDependencyError, match=r"mikasa-robo-suite at .*nowhere"):
-        _official("RememberColor3-v0", tmp_path / "nowhere", 2, 60)
+def test_an_interpreter_that_fails_is_named(tmp_path: Path) -> None:
     broken = program(tmp_path / "broken", "echo no such module >&2; exit 1")
     with pytest.raises(ConformanceError, match="no such module"):
         _official("RememberColor3-v0", broken, 2, 60)

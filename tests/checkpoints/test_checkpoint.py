@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from vla_eval.checkpoints.files import find_checkpoint
+from vla_eval.checkpoints.verify import Verified
 from vla_eval.config import shipped
 from vla_eval.errors import CheckpointError
 
@@ -47,3 +48,19 @@ def test_a_path_is_never_looked_for_elsewhere() -> None:
 def test_a_mistyped_name_is_answered_with_the_closest_one() -> None:
     with pytest.raises(CheckpointError, match="Did you mean 'memory_small'"):
         find_checkpoint(Path("memory_smal"))
+
+
+def test_the_report_of_a_check_names_each_statistic_only_if_asked() -> None:
+    statistics = ("action.mean", "action.std", "observation.state.mean")
+    found = Verified(
+        folder=Path("run"),
+        kind="act",
+        n_tensors=1,
+        n_parameters=2,
+        n_trained=2,
+        statistics=statistics,
+        chunk=(1, 4, 7),
+        sha256="0" * 64,
+    )
+    assert "statistics   3 of action, observation.state" in found.lines()
+    assert f"statistics   {', '.join(statistics)}" in found.lines(verbose=True)

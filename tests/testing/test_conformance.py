@@ -145,3 +145,30 @@ def test_a_policy_with_memory_by_slot_passes_and_the_check_says_what_it_tried() 
     assert met == said
     assert "The same episode seed and observations give the same actions beside another episode." in met
     assert "A chunk is float32 of shape (2, 7) and finite." in met
+
+
+class NotANumberLater:
+    """Gives NaN in row 1, dimension `dz`, of its second chunk."""
+
+    def __init__(self) -> None:
+        self.spec = BrokenPolicy("none").spec
+        self._n_chunks = 0
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        self._n_chunks = 0
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        actions = np.zeros((2, 7), dtype=np.float32)
+        if self._n_chunks == 1:
+            actions[1, 2] = np.nan
+        self._n_chunks += 1
+        return ActionChunk(actions=actions)
+
+
+def test_a_number_that_is_not_finite_is_named_by_row_dimension_and_step() -> None:
+    env: Any = make_env(FAKE)
+    # Chunks of two actions: the second one begins at step 2. The first episode of the check has seed 2.
+    with pytest.raises(
+        ConformanceError, match=r"nan in row 1, dimension 'dz', of the chunk at step 2 \(seed 2\)"
+    ):
+        check_policy(NotANumberLater, env.spec)

@@ -45,14 +45,18 @@ class Verified:
     chunk: tuple[int, ...]
     sha256: str
 
-    def lines(self) -> list[str]:
-        """Return lines for a person."""
+    def lines(self, *, verbose: bool = False) -> list[str]:
+        """Return lines for a person; `verbose`: with the name of each statistic."""
+        fields = dict.fromkeys(name.rpartition(".")[0] for name in self.statistics)
+        statistics = f"{len(self.statistics)} of {', '.join(fields)}" if fields else ""
+        if verbose:
+            statistics = ", ".join(self.statistics)
         return [
             f"checkpoint   {self.folder} ({self.sha256[:12]})",
             f"type         {self.kind}",
             f"weights      {self.n_tensors} tensors, none missing, none left over, all finite",
             f"parameters   {self.n_parameters:,}, of which {self.n_trained:,} are trained",
-            f"statistics   {', '.join(self.statistics) or 'none needed'}",
+            f"statistics   {statistics or 'none needed'}",
             f"forward pass {' × '.join(map(str, self.chunk))} actions, all finite",
         ]
 

@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_flags, add_verb
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_flags, add_verb, env_paths
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
@@ -86,7 +86,7 @@ def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
     from vla_eval.tasks.catalog import SUITES
 
     settings: dict[str, Any] = {}  # Any: plain data, checked by `decode` below
-    apply_overrides(settings, args.overrides, cls=EvalConfig)
+    apply_overrides(settings, args.overrides, cls=EvalConfig, free=env_paths(args.overrides))
     # Read strictly, with names of nothing: for the types of what was set.
     checked = decode(EvalConfig, {"name": "x", "tasks": ["x"], "policies": ["x"], **settings}, where="--set")
     tasks = args.tasks or tuple(SUITES[args.suite])

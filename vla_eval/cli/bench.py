@@ -1,8 +1,11 @@
 """`mikasa-vla bench`: rendering, loading, and a policy behind a socket, as ratios from one run."""
 
 import argparse
+import shutil
 from pathlib import Path
 
+from vla_eval.cli.shared.arguments import NUMBERS, task_argument
+from vla_eval.errors import MissingDependencyError
 from vla_eval.strict.bounds import MAX_STEPS, check_bounds
 
 SYNTHETIC = "synthetic"
@@ -19,8 +22,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
     parser = subparsers.add_parser(
         "bench", help="measure rendering, loading or serving, as ratios from one run"
     )
-    parser.add_argument("--task", default="RememberColor3-v0", help="task id (default: %(default)s)")
-    parser.add_argument("--n-action-steps", type=int, nargs="+", default=[1, 4, 8], metavar="K")
+    parser.add_argument(
+        "--task", type=task_argument, default="RememberColor3-v0", help="task id (default: %(default)s)"
+    )
+    parser.add_argument("--n-action-steps", **NUMBERS, default=[1, 4, 8], metavar="K")
     parser.add_argument("--repeats", type=int, default=2, help="the lowest of so many times counts")
     parser.add_argument("--wrist-mesh", choices=("shipped", "whole", "simplified"), default="shipped")
     parser.add_argument(
@@ -59,9 +64,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]"
         metavar="POLICY",
         help="instead: a policy behind a socket against copies of it (a small transformer if none is named)",
     )
-    parser.add_argument(
-        "--sessions", type=int, nargs="+", default=[1, 4, 8, 16], metavar="N", help="with --serve"
-    )
+    parser.add_argument("--sessions", **NUMBERS, default=[1, 4, 8, 16], metavar="N", help="with --serve")
     parser.add_argument(
         "--seconds", type=float, default=10.0, help="of each rate, with --serve (default: %(default)s)"
     )
@@ -80,11 +83,34 @@ def run(args: argparse.Namespace) -> int:
         "baseline_episodes": (2, MAX_MEASURED_EPISODES),
     }
     check_bounds(args, bounds, prefix="bench: ")
+    _look_for(args)
     if args.serve is not None:
         return _serving(args)
     if args.against_official is not None:
         return _official(args)
     return _loader(args) if args.loader else _rendering(args)
+
+
+def _look_for(args: argparse.Namespace) -> None:
+    """Look for what is named, before torch or a simulator is loaded.
+
+    Raises:
+        VlaEvalError: there is no such task, policy, dataset or interpreter.
+    """
+    from vla_eval.data.info_file import require_folder
+    from vla_eval.policies.recipe import load_policy_recipe
+    from vla_eval.tasks.catalog import task_spec
+
+    task_spec(args.task)
+    if args.serve:
+        load_policy_recipe(args.serve)
+    if args.against_official and shutil.which(args.against_official) is None:
+        raise MissingDependencyError(
+            f"bench: expected a Python interpreter that has mikasa-robo-suite at {args.against_official}, "
+            "found none. docs/speed.md says how to install it."
+        )
+    if args.loader not in (None, SYNTHETIC):
+        require_folder(Path(args.loader))
 
 
 def _loader(args: argparse.Namespace) -> int:

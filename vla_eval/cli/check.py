@@ -5,7 +5,7 @@ import functools
 import sys
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb, api_key_of
+from vla_eval.cli.shared.arguments import add_verb, api_key_of, task_argument
 from vla_eval.errors import RecipeError
 
 URL_SCHEMES = ("ws://", "wss://")
@@ -32,7 +32,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     )
     parser.add_argument("policy", metavar="POLICY", help="name, file, folder, or ws://HOST:PORT")
     parser.add_argument(
-        "--task", metavar="TASK", help=f"whose cameras and states it gets (default: {DEFAULT_TASK})"
+        "--task",
+        type=task_argument,
+        metavar="TASK",
+        help=f"whose cameras and states it gets (default: {DEFAULT_TASK})",
     )
     parser.add_argument("--api-key-env", metavar="VAR", help="of a server: variable that holds its key")
     parser.add_argument(

@@ -9,7 +9,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.shared.arguments import add_flags, seeds_argument
+from vla_eval.cli.shared.arguments import add_flags, seeds_argument, task_argument
 from vla_eval.errors import DatasetError
 
 if TYPE_CHECKING:
@@ -37,7 +37,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         help="replay a recording, and write what the arm did in this control mode (env.control_mode)",
     )
     convert.add_argument("--out", metavar="DIR", type=Path, required=True, help="a new folder")
-    convert.add_argument("--task", metavar="T", help="task id, for sources without an instruction")
+    convert.add_argument(
+        "--task", type=task_argument, metavar="T", help="task id, for sources without an instruction"
+    )
     convert.add_argument("--state", choices=("eef", "joints"), help="what observation.state is (eef)")
     convert.add_argument(
         "--image-size",
@@ -73,14 +75,14 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
     adopt = action("adopt", help="use a dataset that lerobot-edit-dataset has edited")
     adopt.add_argument("dataset", metavar="DIR", type=Path, help="a dataset with this project's fields")
-    adopt.add_argument("--task", metavar="T", help="task id of its demonstrations")
+    adopt.add_argument("--task", type=task_argument, metavar="T", help="task id of its demonstrations")
 
     leak = action(
         "check-leak",
         help="whether demonstrations begin as the evaluation's episodes do (exit code 1 if any does)",
     )
     leak.add_argument("dataset", metavar="DIR", type=Path, help="a dataset, or what `convert` reads")
-    leak.add_argument("--task", metavar="T", help="task id, for datasets that name none")
+    leak.add_argument("--task", type=task_argument, metavar="T", help="task id, for datasets that name none")
     leak.add_argument("--seeds", metavar="A-B", type=seeds_argument, help="seeds of the evaluation (1-100)")
 
     card = action("card", help="write README.md and a contact sheet")
@@ -99,7 +101,20 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the action."""
+    """Do the action; what it reads is looked for first, before torch is loaded.
+
+    Raises:
+        VlaEvalError: an unknown task, no such folder, or what the action raises.
+    """
+    from vla_eval.data.info_file import require_folder
+    from vla_eval.tasks.catalog import task_spec
+
+    if getattr(args, "task", None) is not None:
+        task_spec(args.task)
+    read = {"convert": "source", "mix": "datasets", "pull": None}.get(args.action, "dataset")
+    named = [] if read is None else getattr(args, read)
+    for folder in named if isinstance(named, list) else [named]:
+        require_folder(folder)
     return _ACTIONS[args.action](args)
 
 
@@ -243,10 +258,7 @@ def _check_leak(args: argparse.Namespace) -> int:
     from vla_eval.data.sharing.initial_states import read_initial_states
     from vla_eval.data.sharing.leak import check_leak
     from vla_eval.results.printed_table import markdown_table
-    from vla_eval.tasks.catalog import task_spec
 
-    if args.task is not None:
-        task_spec(args.task)  # a mistyped name must not wait for the dataset
     dataset = read_initial_states(args.dataset)
     task = args.task or dataset.task
     if task is None:

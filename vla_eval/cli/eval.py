@@ -11,6 +11,7 @@ from vla_eval.cli.shared.arguments import (
     add_flags,
     add_old_flag,
     add_verb,
+    env_paths,
     positive_argument,
     read_config,
     set_flags,
@@ -219,7 +220,7 @@ def _config(args: argparse.Namespace) -> EvalConfig:
             if which is not None:
                 flag = f"--capture-{kind}"
                 set_field(EvalConfig, data, f"capture.{kind}", _which(which, flag=flag), where=flag)
-        apply_overrides(data, args.overrides, cls=EvalConfig)
+        apply_overrides(data, args.overrides, cls=EvalConfig, free=env_paths(args.overrides))
         fill_from_protocol(data)
 
     return read_config(

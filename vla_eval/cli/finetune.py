@@ -14,6 +14,7 @@ from vla_eval.cli.shared.arguments import (
     positive_argument,
     read_config,
     set_flags,
+    task_argument,
     typed_command,
 )
 from vla_eval.config.files import apply_overrides
@@ -51,7 +52,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         metavar="NAME",
         help="recipe in policies/ with a `finetune` section; of a table: its rows",
     )
-    parser.add_argument("--task", nargs="+", dest="tasks", metavar="T", help="of a table: its tasks")
+    parser.add_argument(
+        "--task", nargs="+", type=task_argument, dest="tasks", metavar="T", help="of a table: its tasks"
+    )
     parser.add_argument("--dataset", metavar="DIR", help="folder of one dataset, or a folder that holds one")
     parser.add_argument("--steps", type=int, metavar="N", help="gradient steps (the recipe's)")
     parser.add_argument("--batch-size", type=int, metavar="B", help="samples per step (the recipe's)")
@@ -104,17 +107,18 @@ def run(args: argparse.Namespace) -> int:
             "--cluster is for a table of learned policies, whose fine-tunings run side by side. One "
             "fine-tuning runs on this machine; on several GPUs by `accelerate launch` (docs/finetuning.md)."
         )
+    config, command = _config(args), typed_command()
+    # Here and not above: `mikasa-vla --help` need not wait for numpy.
+    from vla_eval.training.request import finished_run, look_for
+
+    look_for(config, is_dry=args.dry_run)
     if args.dry_run:
         from vla_eval.training.dry_run import describe_finetuning
 
         with contextlib.redirect_stdout(sys.stderr), dry_run_options(args) as options:
-            lines = describe_finetuning(_config(args), options)
+            lines = describe_finetuning(config, options)
         print("\n".join(lines))
         return 0
-    config, command = _config(args), typed_command()
-    # Here and not above: `mikasa-vla --help` need not wait for numpy.
-    from vla_eval.training.request import finished_run
-
     finished = finished_run(config)
     if finished is not None:
         print(finished, file=sys.stderr)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import NoReturn, Protocol, cast
 
 from vla_eval import __version__
+from vla_eval.cli.shared.slips import about_choice, about_empty, about_flag
 from vla_eval.cli.terminal.streams import standard_streams
 from vla_eval.errors import MAX_SHOWN, VlaEvalError, did_you_mean
 from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
@@ -79,6 +80,14 @@ class _Parser(argparse.ArgumentParser):
         text = _with_short_words(message)
         self.exit(EXIT_USER_MISTAKE, f"{self.prog}: error: {text}\nSee `{self.prog} --help`.\n")
 
+    def _check_value(self, action: argparse.Action, value: object) -> None:
+        """Suggest a choice where argparse only lists them."""
+        try:
+            super()._check_value(action, value)
+        except argparse.ArgumentError as exc:
+            message = f"{exc.message}.{about_choice(value, action.choices or ())}"
+            raise argparse.ArgumentError(action, message) from exc
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line and return the exit code.
@@ -94,6 +103,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _run(arguments: list[str]) -> int:
     if (nul := next((one for one in arguments if "\0" in one), None)) is not None:
         return _fail(_no_text(nul))
+    if (empty := about_empty(arguments)) is not None:
+        return _fail(empty)
     first = arguments[0] if arguments else ""
     if not arguments:
         print(FIRST_STEPS)
@@ -177,7 +188,7 @@ def _unknown_arguments(parser: argparse.ArgumentParser, verb: str, unknown: Sequ
     help_line = f" See `{program} --help`."
     if flag is None:
         return f"{verb}: expected no more arguments, found {' '.join(unknown)}.{help_line}"
-    return f"{verb}: there is no flag '{flag}'.{did_you_mean(flag, flags_of(parser))}{help_line}"
+    return f"{verb}: there is no flag '{flag}'.{about_flag(flag, flags_of(parser))}{help_line}"
 
 
 def flags_of(parser: argparse.ArgumentParser) -> list[str]:

@@ -9,8 +9,10 @@ from typing import TYPE_CHECKING, Any
 from vla_eval.cli.shared.arguments import (
     EXIT_EPISODE_ERRORS,
     MANY,
+    NUMBERS,
     add_flags,
     add_verb,
+    env_paths,
     read_config,
     set_flags,
 )
@@ -63,7 +65,8 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     )
     parser.set_defaults(out=Path("runs/probe"))
     for flag, (dest, kind, metavar, text) in INTERVENTIONS.items():
-        parser.add_argument(flag, **MANY, dest=dest, type=kind, metavar=metavar, help=text)
+        many = NUMBERS if kind is int else {**MANY, "type": kind}
+        parser.add_argument(flag, **many, dest=dest, metavar=metavar, help=text)
     parser.add_argument(
         "--grid",
         action="store_true",
@@ -249,7 +252,7 @@ def _config(args: argparse.Namespace) -> EvalConfig:
 
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "workers"))
-        apply_overrides(data, args.overrides, cls=EvalConfig)
+        apply_overrides(data, args.overrides, cls=EvalConfig, free=env_paths(args.overrides))
 
     return read_config(
         EvalConfig,

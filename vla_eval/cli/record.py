@@ -6,7 +6,14 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from vla_eval.cli.shared.arguments import add_flags, add_verb, read_config, set_flags, typed_command
+from vla_eval.cli.shared.arguments import (
+    add_flags,
+    add_verb,
+    env_paths,
+    read_config,
+    set_flags,
+    typed_command,
+)
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.config.dataset import DatasetRecipe, fingerprint
@@ -149,7 +156,7 @@ def _recipe(args: argparse.Namespace) -> DatasetRecipe:
 
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("tasks", "episodes", "seed_start", "workers"))
-        apply_overrides(data, args.overrides, cls=DatasetRecipe)
+        apply_overrides(data, args.overrides, cls=DatasetRecipe, free=env_paths(args.overrides))
 
     return read_config(
         DatasetRecipe,

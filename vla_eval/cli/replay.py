@@ -6,7 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_flags, add_verb
+from vla_eval.cli.shared.arguments import NUMBERS, add_flags, add_verb
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.errors import RecipeError
@@ -30,7 +30,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         epilog=EPILOG,
     )
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset, or of some")
-    parser.add_argument("--episodes", type=int, nargs="+", metavar="N", help="only these (default: all)")
+    parser.add_argument("--episodes", **NUMBERS, metavar="N", help="only these (default: all)")
     parser.add_argument("--pixels", action="store_true", help="render, and compare images and video, too")
     add_flags(parser, "--workers", "--cluster", "--json-progress")
     parser.set_defaults(workers="auto")

@@ -7,7 +7,7 @@ import os
 import sys
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb, api_key_of
+from vla_eval.cli.shared.arguments import add_verb, api_key_of, task_argument
 from vla_eval.errors import MAX_SHOWN
 from vla_eval.workers.start import WORKER_ENVIRONMENT
 
@@ -42,7 +42,9 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
         metavar="S",
         help="drop sessions without a message for so long (600)",
     )
-    parser.add_argument("--task", metavar="T", help="for policies that depend on the task")
+    parser.add_argument(
+        "--task", type=task_argument, metavar="T", help="for policies that depend on the task"
+    )
     parser.add_argument(
         "--n-action-steps", type=int, metavar="K", help="for scripted policies: actions of a chunk (1)"
     )

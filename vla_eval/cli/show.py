@@ -1,4 +1,4 @@
-"""`mikasa-vla show TASK`: what a task asks for, how it is scored, which arguments it takes.
+"""`mikasa-vla show NAME`: a task (what it asks for, how it is scored, its arguments), or a recipe's fields.
 
 The task's source is read, not imported: importing it would start a simulator.
 """
@@ -12,8 +12,15 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from vla_eval.config.dataset import DatasetRecipe
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import Folder, list_recipes, load_recipe
+from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.config.protocol import Protocol
+from vla_eval.errors import unknown_name
+from vla_eval.evaluation.model_table import ModelTable, is_model_table
+from vla_eval.tasks.catalog import FAMILIES, TASKS, find_task, installed_tasks, task_spec
 from vla_eval.tasks.spec import PhaseSource, TaskSpec
 
 WIDTH = 100
@@ -27,6 +34,25 @@ OFFICIAL_PHASES: dict[PhaseSource, str] = {
 NOT_FOR_USERS = ("instruction", "reconfiguration_freq")  # chosen by other options or not at all
 
 
+_RecipeClass = type[PolicyRecipe | EvalConfig | ModelTable | DatasetRecipe | Protocol]
+
+
+class _Kind(NamedTuple):
+    """Recipes of one folder: what one is called, what it is read as, and what is done with it."""
+
+    word: str
+    recipe: _RecipeClass
+    next_step: str
+
+
+KINDS: dict[Folder, _Kind] = {
+    "policies": _Kind("policy", PolicyRecipe, "mikasa-vla check {name}"),
+    "configs": _Kind("config", EvalConfig, "mikasa-vla eval {name}"),
+    "datasets": _Kind("dataset", DatasetRecipe, "mikasa-vla record {name}"),
+    "protocols": _Kind("protocol", Protocol, "mikasa-vla eval --protocol {name} --policy POLICY"),
+}
+
+
 class TaskArgument(NamedTuple):
     """One keyword argument of a task's class, as its source has it."""
 
@@ -37,16 +63,27 @@ class TaskArgument(NamedTuple):
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser("show", help="explain one task", allow_abbrev=False)
-    parser.add_argument("task", metavar="TASK", help="task id (`mikasa-vla list tasks`)")
+    parser = subparsers.add_parser(
+        "show", help="explain one task, policy, configuration, dataset or protocol", allow_abbrev=False
+    )
+    parser.add_argument(
+        "name", metavar="NAME", help="task id, or name or file of a recipe (`mikasa-vla list`)"
+    )
     parser.add_argument(
         "--prompt-set", default=DEFAULT_PROMPT_SET, metavar="NAME", help="which instructions (paper)"
     )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Explain the task, without starting a simulator."""
-    spec = task_spec(args.task)
+    """Explain what is named, without starting a simulator.
+
+    Raises:
+        UnknownNameError: there is nothing of this name; the message suggests the closest one of all kinds.
+        RecipeError: it is a recipe that cannot be read.
+    """
+    if find_task(args.name) is None:
+        return _show_recipes(args.name)
+    spec = task_spec(args.name)
     if spec.is_official:
         return _show_official(spec, args.prompt_set)
     _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory)")
@@ -71,6 +108,39 @@ def run(args: argparse.Namespace) -> int:
             continue
         print(f"{'':{INDENT}}{argument.name} = {default}  ({argument.origin})")
     return 0
+
+
+def _show_recipes(name: str) -> int:
+    """Print the recipes of a name, of whatever kind; a file is one of the kind that its folder says."""
+    stem = Path(name.removesuffix(".yaml")).name
+    folder = Path(name).parent.name
+    kinds = [kind for kind in KINDS if folder in ("", kind)]
+    found = [kind for kind in kinds if stem in list_recipes(kind)]
+    if not found:
+        known = [one for kind in KINDS for one in list_recipes(kind)]
+        raise unknown_name(
+            "task, policy, configuration, dataset or protocol",
+            name,
+            {*TASKS, *FAMILIES, *installed_tasks(), *known},
+        )
+    for kind in found:
+        _show_recipe(kind, stem if folder in ("", kind) else name)
+    return 0
+
+
+def _show_recipe(folder: Folder, name: str) -> None:
+    kind = KINDS[folder]
+    cls: _RecipeClass = ModelTable if folder == "configs" and is_model_table(name) else kind.recipe
+    recipe = load_recipe(folder, name, cls)
+    next_step = kind.next_step
+    if isinstance(recipe.value, PolicyRecipe) and recipe.value.finetune is not None:
+        next_step = "mikasa-vla finetune --policy {name} --dataset DIR"
+    elif cls is ModelTable:
+        next_step = "mikasa-vla finetune {name}, then mikasa-vla eval {name}"
+    _print(kind.word, f"{recipe.name} ({recipe.path})")
+    _print("about", recipe.value.description)
+    _print("next", next_step.format(name=recipe.name))
+    print(f"fields\n{textwrap.indent(recipe.path.read_text(encoding='utf-8').rstrip(), '  ')}")
 
 
 def _show_official(spec: TaskSpec, prompt_set: str) -> int:

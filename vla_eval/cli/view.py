@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb
+from vla_eval.cli.shared.arguments import NUMBERS, add_verb, task_argument
 from vla_eval.lock.switch import own_need
 
 DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd …` captured in the rerun viewer.
@@ -31,12 +31,10 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder (runs/…), or a dataset")
     parser.add_argument("--seed", type=int, metavar="S", help="only this seed")
-    parser.add_argument("--task", metavar="T", help="only this task")
+    parser.add_argument("--task", type=task_argument, metavar="T", help="only this task")
     parser.add_argument("--policy", metavar="P", help="only this policy")
     parser.add_argument("--n-action-steps", type=int, metavar="K", help="only this K")
-    parser.add_argument(
-        "--episode", type=int, nargs="+", metavar="I", help="of a dataset: only these numbers"
-    )
+    parser.add_argument("--episode", **NUMBERS, metavar="I", help="of a dataset: only these numbers")
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--web", action="store_true", help="serve the viewer to a browser")
     how.add_argument("--print", action="store_true", help="print the paths of the files, open nothing")

@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -138,14 +139,23 @@ def _read(folder: Folder, name: str) -> _File:
     return _File(path, where, hashlib.sha256(content).hexdigest(), data)
 
 
-def apply_overrides(data: dict[str, Any], overrides: Sequence[str], *, cls: type) -> None:
-    """Change `data` in place by `a.b=c` each, c read as YAML; refuse no `=`, no YAML, or no such field."""
+def apply_overrides(
+    data: dict[str, Any],
+    overrides: Sequence[str],
+    *,
+    cls: type,
+    free: Mapping[str, Sequence[str]] = types.MappingProxyType({}),
+) -> None:
+    """Change `data` in place by `a.b=c` each, c read as YAML; refuse no `=`, no YAML, or no such field.
+
+    `free` is that of `set_field`.
+    """
     for override in overrides:
         path, equals, text = override.partition("=")
         where = f"--set {override:.{MAX_SHOWN}}"
         if not equals or not all(path.split(".")):
             raise RecipeError(f"{where}: expected FIELD=VALUE, for example --set chunking.delay_steps=2.")
-        set_field(cls, data, path, load_yaml(text, where=where), where=where)
+        set_field(cls, data, path, load_yaml(text, where=where), where=where, free=free)
 
 
 def to_data(value: Any) -> Any:  # Any: plain data of whatever the recipe holds

@@ -6,8 +6,9 @@ from pathlib import Path
 
 from vla_eval.data.facts import KINDS, DatasetFacts, Facts, find_facts, kind_of, read_facts
 from vla_eval.data.folder_contents import check_folder
-from vla_eval.data.manifest import FAILED_FILE, MANIFEST_FILE, RECORDING_FILE, FileDigest
-from vla_eval.errors import DatasetError
+from vla_eval.data.info_file import INFO_FILE
+from vla_eval.data.manifest import FAILED_FILE, MANIFEST_FILE, MIKASA_FOLDER, RECORDING_FILE, FileDigest
+from vla_eval.errors import DatasetError, some_of
 
 # What a dataset consists of; a card, a replay's report and what the Hub's client leaves are not part of it.
 CONTENT = (
@@ -18,6 +19,8 @@ CONTENT = (
     "meta/episodes/**/*.parquet",
 )
 
+DEEPEST = 3  # folders below the named one in which datasets are looked for, for a message
+
 
 def check_complete(root: Path) -> Facts:
     """Return what a dataset is, after comparing all of its files with their digests.
@@ -26,15 +29,43 @@ def check_complete(root: Path) -> Facts:
         DatasetError: it is not finished, or files are missing or not what they were.
     """
     check_folder(root)
-    facts = find_facts(root)
-    if facts is None:
-        *others, last = (str(kind.file) for kind in KINDS)
-        raise DatasetError(
-            f"{root}: not a complete dataset of this project: none of {', '.join(others)} and {last}, which "
-            f"are written last, is there. Run the command that makes it again: a recording resumes."
-        )
-    _check_files(root, facts)
+    _check_files(root, facts := require_finished(root))
     return facts
+
+
+def require_finished(root: Path) -> Facts:
+    """Return what a dataset says that it is; its files are not read.
+
+    Raises:
+        DatasetError: there is none, or it is not finished, or another program made it.
+    """
+    facts = find_facts(root)
+    if facts is not None:
+        return facts
+    if not (root / MIKASA_FOLDER).is_dir() and not (root / INFO_FILE).is_file():
+        raise DatasetError(
+            f"{root}: expected the folder of a dataset, found no {INFO_FILE} in it.{datasets_below(root)}"
+        )
+    *others, last = (str(kind.file) for kind in KINDS)
+    raise DatasetError(
+        f"{root}: not a complete dataset of this project: none of {', '.join(others)} and {last}, which "
+        f"are written last, is there. {_how_to_finish(root)}"
+    )
+
+
+def datasets_below(root: Path) -> str:
+    """Return a sentence for a message: which datasets lie a few folders below, or how to make one."""
+    depths = (f"{'*/' * depth}{INFO_FILE}" for depth in range(1, DEEPEST + 1))
+    below = sorted(path.parent.parent for pattern in depths for path in root.glob(pattern))
+    if not below:
+        return " `mikasa-vla record` makes datasets; a recording that was stopped is resumed by its command."
+    return f" Below it are {some_of(below)}. Name one."
+
+
+def _how_to_finish(root: Path) -> str:
+    if (root / MIKASA_FOLDER).is_dir():
+        return "Run the command that makes it again: a recording resumes."
+    return "If another program made it: mikasa-vla dataset check shows how it can be used."
 
 
 def check_dataset(root: Path) -> DatasetFacts:

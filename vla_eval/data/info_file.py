@@ -5,6 +5,7 @@ and takes text for numbers. Knows nothing of the files that the templates name.
 """
 
 import math
+import os
 import re
 import string
 from dataclasses import dataclass, field, fields
@@ -131,10 +132,20 @@ def _is_template(template: str, allowed: frozenset[str]) -> bool:
     return True
 
 
+def require_folder(root: Path) -> None:
+    """Raise `DatasetError` if there is no such folder, or nothing in it: before anything heavy is loaded."""
+    # os.path, unlike Path, says no to what cannot be a path at all: too long, or with a NUL.
+    if not os.path.isdir(root):
+        raise DatasetError(f"{root!s:.300}: there is no such folder. `mikasa-vla record` makes datasets.")
+    if not os.listdir(root):
+        raise DatasetError(
+            f"{root}: expected a dataset, found an empty folder. `mikasa-vla record` makes datasets."
+        )
+
+
 def one_dataset(root: Path) -> Path:
     """Return the folder itself, or the one dataset in it: `record --out DIR` makes DIR/TASK."""
-    if not root.is_dir():
-        raise DatasetError(f"{root}: there is no such folder. `mikasa-vla record` makes datasets.")
+    require_folder(root)
     if (root / INFO_FILE).is_file():
         return root
     held = sorted(path for path in root.iterdir() if (path / INFO_FILE).is_file())

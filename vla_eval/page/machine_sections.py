@@ -33,8 +33,12 @@ class LatencyTable:
 
 
 def latency(material: Material) -> LatencyTable:
-    """Return times of inferences by run, task, policy and K."""
-    rows, n_unknown = [], 0
+    """Return times of inferences by task, policy, K and run."""
+    rows: list[tuple[tuple[int, int, int], list[str]]] = []
+    n_unknown = 0
+    records = [record for run in material.runs for record in run.records]
+    tasks = list(dict.fromkeys(record.task for record in records))
+    policies = list(dict.fromkeys(record.policy for record in records))
     several_tasks = len(material.tasks) > 1
     for run in material.runs:
         results = [record for record in run.records if record.outcome != "error"]
@@ -46,17 +50,18 @@ def latency(material: Material) -> LatencyTable:
                 continue
             task, policy, size = group
             seconds = (measured.median_seconds, measured.slowest_seconds)
-            rows.append(
-                [
-                    f"{task} · {policy} · K={size}" if several_tasks else f"{policy} · K={size}",
-                    str(run.path),
-                    str(measured.n_episodes),
-                    *(f"{value * 1000:.2f}" for value in seconds),
-                    f"{measured.episode_seconds:.2f}",
-                ]
-            )
+            place = (tasks.index(task), policies.index(policy), size)
+            row = [
+                f"{task} · {policy} · K={size}" if several_tasks else f"{policy} · K={size}",
+                str(run.path),
+                str(measured.n_episodes),
+                *(f"{value * 1000:.2f}" for value in seconds),
+                f"{measured.episode_seconds:.2f}",
+            ]
+            rows.append((place, row))
     times = ("ms per inference, median", "slowest episode", "s per episode, median")
-    table = page_table(rows, text=("policy", "run"), numbers=("episodes", *times))
+    rows.sort(key=lambda one: one[0])  # stable: runs stay in their order
+    table = page_table([row for _, row in rows], text=("policy", "run"), numbers=("episodes", *times))
     return LatencyTable(table=table, n_unknown=n_unknown)
 
 

@@ -136,7 +136,7 @@ def _columns(sweep: Sweep) -> list[Column[SweepRow]]:
         Column("p", compared(lambda one: f"{one.test.p_value:.3g}"), rank=7),
         Column("p (Holm)", compared(lambda one: f"{one.corrected_p:.3g}")),
         Column(
-            "episodes to settle",
+            f"episodes to settle ±{sweep.difference:g}",
             lambda row: UNDEFINED if row.n_to_settle is None else str(row.n_to_settle),
             rank=3,
         ),

@@ -38,13 +38,22 @@ def check_value(hint: Any, value: object, *, path: str) -> Any:  # Any: a type a
     return _decoded(hint, value, path=path)
 
 
-def set_field(cls: type, data: dict[str, Any], path: str, value: Any, *, where: str) -> None:
+def set_field(
+    cls: type,
+    data: dict[str, Any],
+    path: str,
+    value: Any,
+    *,
+    where: str,
+    free: Mapping[str, Sequence[str]] = types.MappingProxyType({}),
+) -> None:
     """Put a plain value at a dotted path (`chunking.mode`) of plain data, in place.
 
-    In a mapping all names are free. `where` is the flag, for messages. A field that the dataclass has not, or
-    a part of the path that has no fields, is refused.
+    In a mapping all names are free. `where` is the flag, for messages; `free` is name -> the paths that it
+    may be meant for in such mappings. A field that the dataclass has not, or a part of the path that has no
+    fields, is refused.
     """
-    steps = _walk(cls, path, where=where)
+    steps = _walk(cls, path, where=where, free=free)
     for step in steps[:-1]:
         _rename(step, data)
         if data.get(step.name) is None:  # not given, or given without a value
@@ -65,7 +74,7 @@ class _Step(NamedTuple):
     name: str
 
 
-def _walk(cls: type, path: str, *, where: str) -> list[_Step]:
+def _walk(cls: type, path: str, *, where: str, free: Mapping[str, Sequence[str]]) -> list[_Step]:
     """Return the steps of a dotted path, by their current names; in a mapping all names are free."""
     current: Any = cls  # Any: a type annotation
     names = path.split(".")
@@ -83,7 +92,8 @@ def _walk(cls: type, path: str, *, where: str) -> list[_Step]:
         hints = _hints(found)
         known = current_names(found).get(name, name)
         if known not in hints:
-            raise RecipeError(f"{where}: {_no_such_field(f'{prefix}{name}', name, list(hints))}")
+            within = [] if prefix else [*free.get(name, ()), *_fields_within(found, name)]
+            raise RecipeError(f"{where}: {_no_such_field(f'{prefix}{name}', name, list(hints), within)}")
         if known != name:
             warn_renamed(f"'{prefix}{name}'", f"'{prefix}{known}'")
         steps.append(_Step(found, prefix, known))
@@ -174,8 +184,19 @@ def _is_dataclass_type(hint: Any) -> bool:  # Any: a type annotation
     return isinstance(hint, type) and dataclasses.is_dataclass(hint)
 
 
-def _no_such_field(path: str, name: str, known: list[str]) -> str:
-    return f"there is no field '{path:.{MAX_SHOWN}}'.{did_you_mean(name, known)} Known: {', '.join(known)}."
+def _no_such_field(path: str, name: str, known: list[str], within: Sequence[str] = ()) -> str:
+    meant = f" Did you mean '{"' or '".join(within)}'?" if within else did_you_mean(name, known)
+    return f"there is no field '{path:.{MAX_SHOWN}}'.{meant} Known: {', '.join(known)}."
+
+
+def _fields_within(cls: type, name: str) -> list[str]:
+    """Return the paths of the sections of a dataclass that have a field of this name."""
+    sections = ((field, option) for field, hint in _hints(cls).items() for option in _options(hint))
+    return [
+        f"{field}.{name}"
+        for field, option in sections
+        if _is_dataclass_type(option) and name in _hints(option)
+    ]
 
 
 def _wrong(path: str, expected: str, value: object) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import get_args
 
-from vla_eval.errors import PluginError, unknown_name
+from vla_eval.errors import PluginError, UnknownNameError, unknown_name
 from vla_eval.tasks.catalogs.official_catalog import (
     MIKASA_VLA_90,
     NAMESPACE_90,
@@ -25,6 +25,7 @@ from vla_eval.tasks.spec import Suite, TaskSpec
 
 TASK_GROUP = "vla_eval.tasks"
 TASK_ID = re.compile(r"([A-Za-z]\w*/)?[A-Za-z]\w*(-\w+)*-v\d+", re.ASCII)
+VERSION = re.compile(r"(-VLA)?-v\d+", re.ASCII)
 N_MUGS = 3
 
 
@@ -190,7 +191,22 @@ def find_task(task_id: str) -> TaskSpec | None:
         PluginError: it is not one of ours, and what other packages add cannot be loaded.
     """
     name = task_id.removeprefix("vla_eval/")
-    return _own(name) or installed_tasks().get(name)
+    return _own(name) or installed_tasks().get(name) or _own(with_version(name))
+
+
+def with_version(task_id: str) -> str:
+    """Return `RememberColor3-v0` for `RememberColor3` if that is its only version; else the id as it is."""
+    versions = _versions(task_id)
+    return versions[0] if len(versions) == 1 else task_id
+
+
+def _versions(task_id: str) -> list[str]:
+    """Return the ids that are this one with a version, if it is none itself."""
+    name = task_id.removeprefix("vla_eval/")
+    if _own(name) is not None:
+        return []
+    rows = {**TASKS, **OFFICIAL_TASKS}
+    return [known for known in rows if VERSION.fullmatch(known.removeprefix(name)) and known.startswith(name)]
 
 
 def task_spec(task_id: str) -> TaskSpec:
@@ -209,5 +225,7 @@ def task_spec(task_id: str) -> TaskSpec:
         known = [*TASKS, *FAMILIES, *installed_tasks()]
         if task_id.startswith((NAMESPACE_90, NAMESPACE_ORIGINAL)):
             known = list(OFFICIAL_TASKS)
+        if versions := _versions(task_id):
+            raise UnknownNameError(f"there are several tasks '{task_id}': {', '.join(versions)}. Name one.")
         raise unknown_name("task", task_id.removeprefix("vla_eval/"), known)
     return spec

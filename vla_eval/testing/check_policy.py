@@ -5,7 +5,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from vla_eval.core import ActionChunk, BatchPolicy, EpisodeStart, Observation, ObservationWindow, Policy
+from vla_eval.core import (
+    ActionChunk,
+    BatchPolicy,
+    EpisodeStart,
+    FloatArray,
+    Observation,
+    ObservationWindow,
+    Policy,
+)
+from vla_eval.errors import ConformanceError
 from vla_eval.specs import EnvSpec, PolicySpec, check_compatible
 from vla_eval.testing.claims import claim
 from vla_eval.wire.numbers import noise_state
@@ -117,7 +126,7 @@ class _Runs:
 
     def __init__(self, spec: PolicySpec, env: EnvSpec, observe: Observe | None, instruction: str) -> None:
         self.chunk_shape = (spec.chunk_size, len(env.action.dims))
-        self._spec, self._instruction = spec, instruction
+        self._spec, self._instruction, self._dims = spec, instruction, env.action.dims
         self._observe = observe or (lambda seed, step: _noise(spec, env, seed, step))
 
     def run(self, policy: Policy, *episodes: _Episode) -> Sequence[_Episode]:
@@ -128,7 +137,7 @@ class _Runs:
                 policy.reset([self._start(episode) for episode in begins])
             due = [one for one in episodes if one.begins_after <= turn and len(one.chunks) < N_INFERENCES]
             for episode, chunk in zip(due, self._act(policy, due), strict=True):
-                self._check(chunk, earlier=episode.chunks)
+                self._check(chunk, earlier=episode.chunks, seed=episode.seed)
                 episode.chunks.append(chunk)
         return episodes
 
@@ -161,7 +170,7 @@ class _Runs:
         frames = tuple(self._observe(episode.seed, s) for s in range(first, step + 1))
         return ObservationWindow(slot=episode.slot, frames=frames)
 
-    def _check(self, chunk: ActionChunk, *, earlier: Sequence[ActionChunk]) -> None:
+    def _check(self, chunk: ActionChunk, *, earlier: Sequence[ActionChunk], seed: int) -> None:
         actions = chunk.actions
         claim(
             actions.shape == self.chunk_shape and actions.dtype == np.float32,
@@ -169,13 +178,23 @@ class _Runs:
             f"{actions.dtype} of shape {actions.shape}",
             advice="The shape is (chunk_size, dimensions of an action).",
         )
-        claim(bool(np.isfinite(actions).all()), "Actions are finite.")
+        self._check_finite(actions, seed=seed, step=len(earlier) * self._spec.chunk_size)
         shared = any(np.shares_memory(one.actions, actions) for one in earlier)
         claim(
             not shared,
             "Two chunks must not share a buffer: the first would change.",
             advice="Return a new array each time.",
         )
+
+    def _check_finite(self, actions: FloatArray, *, seed: int, step: int) -> None:
+        wrong = np.argwhere(~np.isfinite(actions))
+        if len(wrong):
+            row, column = (int(index) for index in wrong[0])
+            raise ConformanceError(
+                f"Actions are not finite: {actions[row, column]} in row {row}, dimension "
+                f"'{self._dims[column]}', of the chunk at step {step} (seed {seed}); {len(wrong)} of "
+                f"{actions.size} numbers."
+            )
 
 
 def _noise(spec: PolicySpec, env: EnvSpec, seed: int, step: int) -> Observation:

@@ -1,11 +1,13 @@
 """What a fine-tuning is asked for, and whether its folder has all of it. Waits for no torch."""
 
+import os
+import shlex
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vla_eval.checkpoints.files import checkpoint_sha256, file_sha256, find_checkpoint
-from vla_eval.config.files import Recipe, digest_of, to_data
+from vla_eval.config.files import Recipe, digest_of, list_recipes, to_data
 from vla_eval.config.finetuning import (
     LOGGERS,
     FinetuneConfig,
@@ -13,9 +15,10 @@ from vla_eval.config.finetuning import (
     merge_fields,
 )
 from vla_eval.config.policy import load_policy
+from vla_eval.data.dataset_folder import require_finished
 from vla_eval.data.facts import KINDS
 from vla_eval.data.info_file import one_dataset
-from vla_eval.errors import RecipeError
+from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.held_out import HeldOut
@@ -41,8 +44,15 @@ class FinetuneSummary:
 
 
 def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
-    """Return the policy's recipe for fine-tuning, with the configuration's values on top."""
-    recipe = load_policy(config.policy)
+    """Return the policy's recipe for fine-tuning, with the configuration's values on top.
+
+    Raises:
+        RecipeError: a folder is named, or the recipe has nothing to train.
+    """
+    name = config.policy
+    if os.path.isdir(name) and Path(name).name not in list_recipes("policies"):
+        raise RecipeError(_no_recipe(Path(name)))
+    recipe = load_policy(name)
     if recipe.value.finetune is None:
         raise RecipeError(
             f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "
@@ -51,6 +61,45 @@ def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
     data = merge_fields(to_data(recipe.value.finetune), config.finetune)
     value = decode(FinetuneRecipe, data, where=f"policies/{recipe.name}.yaml, finetune")
     return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
+
+
+def _no_recipe(folder: Path) -> str:
+    """Return what to do with a folder that was named in place of a recipe."""
+    named = shlex.quote(str(folder))
+    record = read_record(folder)
+    if record:
+        return (
+            f"{folder}: is a run of policy '{record.get('policy')}', not a recipe. To continue it, repeat "
+            f"its command, with more --steps if it is finished: {record.get('command')}. To start another "
+            f"training from its weights: --policy {record.get('policy')} --base-checkpoint {named}"
+        )
+    try:
+        find_checkpoint(folder)
+    except CheckpointError:
+        return (
+            f"{folder}: is a folder without a checkpoint, not a recipe. Expected the name of a recipe "
+            "(`mikasa-vla list policies`), or its file."
+        )
+    return (
+        f"{folder}: is a checkpoint, not a recipe. To start from its weights, name the recipe of its kind: "
+        f"--policy RECIPE --base-checkpoint {named}"
+    )
+
+
+def look_for(config: FinetuneConfig, *, is_dry: bool = False) -> None:
+    """Look for recipe, dataset and base, before torch is loaded; `training_job` looks closer.
+
+    A dry run needs neither dataset nor base.
+
+    Raises:
+        VlaEvalError: one is not there, or not what is asked for.
+    """
+    recipe = load_finetune_recipe(config).value
+    if is_dry and not os.path.isdir(config.dataset):
+        return
+    require_finished(one_dataset(Path(config.dataset)))
+    if not is_dry and recipe.base_checkpoint:
+        find_checkpoint(Path(recipe.base_checkpoint))
 
 
 def run_folder_of(config: FinetuneConfig) -> Path:

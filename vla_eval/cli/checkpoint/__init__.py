@@ -2,12 +2,14 @@
 
 import argparse
 import contextlib
+import os
 import sys
 from pathlib import Path
 from typing import Any
 
 from vla_eval.cli.checkpoint import convert, fetch, merge, rehearse
 from vla_eval.cli.shared.arguments import add_verb
+from vla_eval.errors import MAX_SHOWN, CheckpointError
 
 VERBS = ", ".join(convert.converted_families())
 PAGES = [family.docs for family in convert.converted_families().values()]
@@ -33,6 +35,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
     verify.add_argument("path", metavar="PATH", help="a LeRobot checkpoint, or a run of ours")
     verify.add_argument("--device", default="cpu", metavar="D", help="auto, cpu, cuda (cpu)")
     verify.add_argument("--tokenizer", metavar="DIR", help="folder of the tokenizer")
+    verify.add_argument("--verbose", action="store_true", help="name each statistic, not only their fields")
     for module in (convert, fetch, merge, rehearse):
         module.add_parsers(actions)
 
@@ -46,10 +49,34 @@ def run(args: argparse.Namespace) -> int:
         "merge": merge.run,
         **dict.fromkeys(convert.converted_families(), convert.run),
     }
+    if args.action != fetch.FETCH:
+        _look_for(args)
     with contextlib.redirect_stdout(sys.stderr):  # some policies print while they are made
         lines = runs[args.action](args)
     print("\n".join(lines))
     return 0
+
+
+def _look_for(args: argparse.Namespace) -> None:
+    """Look for what is named, before torch is loaded.
+
+    Raises:
+        VlaEvalError: there is no such checkpoint, folder or recipe with something to train.
+    """
+    from vla_eval.checkpoints.files import find_checkpoint
+    from vla_eval.config.finetuning import FinetuneConfig
+    from vla_eval.training.request import load_finetune_recipe
+
+    if args.action == rehearse.REHEARSE and not os.path.isdir(args.name):
+        load_finetune_recipe(FinetuneConfig(policy=args.name, dataset="none"))
+    elif args.action in convert.converted_families():
+        if not os.path.isdir(args.path):
+            raise CheckpointError(
+                f"{args.path:.{MAX_SHOWN}}: expected the folder of a published checkpoint, found no such "
+                "folder. `mikasa-vla checkpoint fetch NAME` gets and converts a published base."
+            )
+    else:
+        find_checkpoint(Path(args.name if args.action == rehearse.REHEARSE else args.path))
 
 
 def _verify(args: argparse.Namespace) -> list[str]:
@@ -59,4 +86,4 @@ def _verify(args: argparse.Namespace) -> list[str]:
     from vla_eval.policies.lerobot.device import choose_device
 
     options = LoadOptions(device=choose_device(args.device), tokenizer=args.tokenizer)
-    return verify_checkpoint(Path(args.path), options).lines()
+    return verify_checkpoint(Path(args.path), options).lines(verbose=args.verbose)

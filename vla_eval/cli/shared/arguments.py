@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from vla_eval.cli.shared.slips import Numbers, numbers
 from vla_eval.config.files import Folder, load_recipe
 from vla_eval.errors import RecipeError
 from vla_eval.results.formats import FORMATS
@@ -120,11 +121,30 @@ def memory_argument(text: str) -> float:
     raise argparse.ArgumentTypeError(f"expected a size such as 80GB or 80GiB, found '{text}'")
 
 
+def env_paths(overrides: Sequence[str]) -> dict[str, list[str]]:
+    """Return `delay_steps` -> `env.delay_steps` of all arguments of tasks, for messages about `--set`."""
+    if not overrides:
+        return {}
+    from vla_eval.cli.show import task_arguments
+    from vla_eval.tasks.catalog import TASKS
+
+    names = ["horizon_steps", *(one.name for task in TASKS.values() for one in task_arguments(task))]
+    return {name: [f"env.{name}"] for name in names}
+
+
+def task_argument(text: str) -> str:
+    """Read the id of a task; without its version, it is the only one that there is."""
+    from vla_eval.tasks.catalog import with_version
+
+    return with_version(text)
+
+
 MANY: Mapping[str, Any] = {"nargs": "+", "action": "extend"}
+NUMBERS: Mapping[str, Any] = {"nargs": "+", "action": Numbers, "type": numbers}
 FLAGS: Mapping[str, Mapping[str, Any]] = {
-    "--task": {**MANY, "dest": "tasks", "metavar": "T", "help": "task ids"},
+    "--task": {**MANY, "type": task_argument, "dest": "tasks", "metavar": "T", "help": "task ids"},
     "--policy": {**MANY, "dest": "policies", "metavar": "P", "help": "names, files or folders"},
-    "--n-action-steps": {**MANY, "type": int, "metavar": "K", "help": "actions per inference"},
+    "--n-action-steps": {**NUMBERS, "metavar": "K", "help": "actions per inference"},
     "--episodes": {"type": int, "metavar": "N"},
     "--seed-start": {"type": int, "metavar": "S", "help": "seed of the first episode (1)"},
     "--workers": {
@@ -192,10 +212,17 @@ def read_config[T](
     Raises:
         VlaEvalError: see `load_recipe`; or a needed flag is missing.
     """
+    from vla_eval.tasks.catalog import with_version
+
+    def complete(data: dict[str, Any]) -> None:  # Any: plain data of YAML
+        edit(data)
+        if isinstance(data.get("tasks"), list):  # anything else is refused when it is decoded
+            data["tasks"] = [with_version(one) if isinstance(one, str) else one for one in data["tasks"]]
+
     if name is not None:
-        return load_recipe(folder, name, cls, edit=edit).value
+        return load_recipe(folder, name, cls, edit=complete).value
     data = dict(start)
-    edit(data)
+    complete(data)
     for field, flag in needed.items():
         if field not in data:
             raise RecipeError(f"Name {asks}; {flag} is missing. Example: mikasa-vla {example}")

@@ -1,0 +1,163 @@
+"""A mistyped name or a missing folder is reported at once: before torch, lerobot or a simulator is loaded."""
+
+import json
+import subprocess
+import sys
+from typing import Any
+
+import pytest
+
+from tests.cli.every_verb import COMMANDS, environment_of, verb_of
+
+TASK = "RememberColor3-v0"
+FAKE = "--set simulator=fake"
+HEAVY = (*("torch", "lerobot", "transformers", "datasets", "mani_skill", "sapien", "cv2", "rerun"),)
+MOST_CPU_SECONDS = 2.0
+# Verb -> command lines, each with a word that the message must have.
+MISTAKES: dict[str, dict[str, str]] = {
+    "eval": {
+        "eval nowhere": "nowhere",
+        f"eval --task RememberColour3-v0 --policy oracle {FAKE}": "RememberColour3-v0",
+        f"eval --task {TASK} --policy orcale {FAKE}": "Did you mean 'oracle'",
+        f"eval --task {TASK} --policy runs/nowhere {FAKE}": "runs/nowhere",
+        f"eval --task {TASK} --policy empty {FAKE}": "empty",
+        f"eval --task {TASK} --policy oracle --protocol paper_vl {FAKE}": "Did you mean 'paper_vla'",
+    },
+    "report": {"report runs/nowhere": "runs/nowhere", "report empty": "empty"},
+    "merge": {"merge runs/nowhere --out new": "runs/nowhere"},
+    "compare": {"compare runs/nowhere": "runs/nowhere"},
+    "check": {
+        "check orcale": "Did you mean 'oracle'",
+        "check runs/nowhere": "runs/nowhere",
+        "check empty": "empty",
+        "check oracle --task RememberColour3-v0": "RememberColour3-v0",
+    },
+    "audit": {
+        f"audit --task RememberColour3-v0 {FAKE}": "RememberColour3-v0",
+        f"audit --task {TASK} --control hodl {FAKE}": "hodl",
+    },
+    "probe": {
+        f"probe --task RememberColour3-v0 --policy oracle {FAKE}": "RememberColour3-v0",
+        f"probe --task {TASK} --policy orcale {FAKE}": "Did you mean 'oracle'",
+        f"probe --task {TASK} --policy runs/nowhere {FAKE}": "runs/nowhere",
+        "probe nowhere": "nowhere",
+    },
+    "view": {"view runs/nowhere --print": "runs/nowhere", "view empty --print": "empty"},
+    "record": {
+        "record nowhere": "nowhere",
+        f"record --task RememberColour3-v0 {FAKE}": "RememberColour3-v0",
+    },
+    "replay": {"replay data/nowhere": "data/nowhere", "replay empty": "empty"},
+    "dataset": {
+        "dataset convert data/nowhere --to npz --out new": "data/nowhere",
+        "dataset convert data/nowhere --control-mode pd_ee_pose --out new": "data/nowhere",
+        "dataset mix data/nowhere data/elsewhere --out new": "data/nowhere",
+        "dataset check data/nowhere": "data/nowhere",
+        "dataset adopt data/nowhere": "data/nowhere",
+        "dataset adopt data/nowhere --task RememberColour3-v0": "RememberColour3-v0",
+        "dataset check-leak data/nowhere": "data/nowhere",
+        "dataset card data/nowhere": "data/nowhere",
+        "dataset push data/nowhere nobody/nothing": "data/nowhere",
+        "dataset push empty nobody/nothing": "empty",
+    },
+    "finetune": {
+        "finetune nowhere": "nowhere",
+        "finetune paper_vla_table": "data/",
+        "finetune --policy acct --dataset data/nowhere": "Did you mean 'act'",
+        "finetune --policy act --dataset data/nowhere": "data/nowhere",
+        "finetune --policy act --dataset empty": "empty",
+        "finetune --policy act --dataset empty --dry-run": "empty",
+        "finetune --policy runs/nowhere --dataset empty": "runs/nowhere",
+        "finetune --policy empty --dataset empty": "empty",
+        "finetune --policy smolvla --dataset data/nowhere --base-checkpoint nowhere": "nowhere",
+    },
+    "checkpoint": {
+        "checkpoint verify runs/nowhere": "runs/nowhere",
+        "checkpoint verify empty": "empty",
+        "checkpoint fetch smolvla_bsae": "Did you mean 'smolvla_base'",
+        "checkpoint rehearse acct": "Did you mean 'act'",
+        "checkpoint rehearse empty": "empty",
+        "checkpoint rehearse oracle": "finetune",
+        "checkpoint merge runs/nowhere --out new": "runs/nowhere",
+        "checkpoint convert-octo runs/nowhere --size small --out new": "runs/nowhere",
+        "checkpoint convert-openvla runs/nowhere --out new": "runs/nowhere",
+        "checkpoint convert-spatialvla runs/nowhere --out new": "runs/nowhere",
+    },
+    "serve": {
+        "serve --policy orcale": "Did you mean 'oracle'",
+        "serve --policy runs/nowhere": "runs/nowhere",
+        "serve --policy empty": "empty",
+        "serve --policy random --task RememberColour3-v0": "RememberColour3-v0",
+    },
+    "list": {"list task": "tasks"},
+    "show": {"show RememberColour3-v0": "Did you mean 'RememberColor3-v0'"},
+    "doctor": {"doctor --jsn": "Did you mean '--json'"},
+    "bench": {
+        "bench --task RememberColour3-v0": "RememberColour3-v0",
+        "bench --loader data/nowhere": "data/nowhere",
+        "bench --serve orcale": "Did you mean 'oracle'",
+        "bench --serve runs/nowhere": "runs/nowhere",
+        "bench --against-official nowhere": "mikasa-robo-suite at nowhere",
+    },
+    "completion": {"completion bsh": "bash"},
+}
+EACH_IN_A_FORK = """
+import io, json, os, resource, sys
+import vla_eval.cli.main as cli
+import importlib
+for verb in cli.VERBS:
+    importlib.import_module(f"vla_eval.cli.{verb}")  # what `mikasa-vla --help` loads
+heavy, commands = json.loads(sys.argv[1]), json.loads(sys.argv[2])
+for command in commands:
+    reader, writer = os.pipe()
+    child = os.fork()
+    if not child:
+        said = io.StringIO()
+        sys.stderr = sys.stdout = said
+        sys.argv = ["mikasa-vla", *command.split()]
+        try:
+            code = cli.main(command.split())
+        except SystemExit as exc:
+            code = exc.code
+        used = resource.getrusage(resource.RUSAGE_SELF)
+        loaded = [name for name in heavy if name in sys.modules]
+        outcome = (code, said.getvalue(), loaded, used.ru_utime + used.ru_stime)
+        os.write(writer, json.dumps(outcome).encode())
+        os._exit(0)
+    os.close(writer)
+    with os.fdopen(reader) as file:
+        print(json.dumps([command, *json.loads(file.read() or '[null, "nothing", [], 0]')]))
+    os.waitpid(child, 0)
+"""
+COMMAND_LINES = [line for lines in MISTAKES.values() for line in lines]
+
+
+@pytest.fixture(scope="module")
+def outcomes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """Each command line, run in a fork of a process that has loaded no more than all verbs do."""
+    work = tmp_path_factory.mktemp("mistakes")
+    (work / "empty").mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", EACH_IN_A_FORK, json.dumps(HEAVY), json.dumps(COMMAND_LINES)],
+        capture_output=True,
+        check=True,
+        cwd=work,
+        env=environment_of(work),
+        text=True,
+        timeout=600,
+    )
+    return {found[0]: found[1:] for found in map(json.loads, done.stdout.splitlines())}
+
+
+def test_every_verb_has_a_trivial_mistake() -> None:
+    assert set(MISTAKES) == {verb_of(name)[0] for name in COMMANDS}
+
+
+@pytest.mark.parametrize(("line", "word"), [pair for lines in MISTAKES.values() for pair in lines.items()])
+def test_a_trivial_mistake_is_reported_before_anything_heavy_is_loaded(
+    line: str, word: str, outcomes: dict[str, Any]
+) -> None:
+    code, message, loaded, seconds = outcomes[line]
+    assert code == 1 and word in message, message
+    assert loaded == []
+    assert seconds < MOST_CPU_SECONDS

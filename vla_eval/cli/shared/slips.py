@@ -1,0 +1,126 @@
+"""Suggestions for flags and words that are often typed for others. Knows nothing of what verbs do."""
+
+import argparse
+from collections.abc import Collection, Iterable, Mapping, Sequence
+
+from vla_eval.errors import did_you_mean
+
+MEANT: Mapping[str, Sequence[str]] = {
+    "--seed": ("--seed-start", "--seeds", "--run-seed"),
+    "--seeds": ("--seed-start", "--seed", "--run-seed"),
+    "--seed-start": ("--seeds", "--seed", "--run-seed"),
+    "--run-seed": ("--seed-start", "--seed"),
+    "--first-seed": ("--seed-start", "--seed"),
+    "--n-episodes": ("--episodes", "--episode"),
+    "--num-episodes": ("--episodes", "--episode"),
+    "--eval-episodes": ("--episodes",),
+    "--tasks": ("--task",),
+    "--env": ("--task",),
+    "--env-id": ("--task",),
+    "--policies": ("--policy",),
+    "--model": ("--policy",),
+    "--checkpoint": ("--base-checkpoint", "--policy"),
+    "--policy-path": ("--policy",),
+    "--num-workers": ("--workers",),
+    "--jobs": ("--workers",),
+    "--chunk-size": ("--n-action-steps",),
+    "--horizon": ("--n-action-steps",),
+    "--action-steps": ("--n-action-steps",),
+    "-K": ("--n-action-steps",),
+    "-k": ("--n-action-steps",),
+    "--output": ("--out",),
+    "--output-dir": ("--out",),
+    "-o": ("--out",),
+    "--dir": ("--out",),
+    "--video": ("--capture-video",),
+    "--record-videos": ("--capture-video",),
+    "--videos": ("--capture-video",),
+    "--rerun": ("--capture-rrd",),
+    "--batch": ("--batch-size", "--max-batch"),
+    "--lr": ("--set",),
+    "--override": ("--set",),
+    "--config": ("--set",),
+    "--resume": (),
+    "--by": (),
+    "--device": (),
+    "--gpu": ("--device",),
+    "--page": ("--html",),
+}
+"""Flag that a verb has not -> flags that may be meant; the first that the verb has is suggested."""
+TOLD: Mapping[str, str] = {
+    "--resume": "The same command again resumes.",
+    "--device": "A policy's recipe says the device: `args: {device: cuda}` (auto by default); for the "
+    "simulator: --set render.backend=gpu.",
+    "--gpu": "A policy's recipe says the device: `args: {device: cuda}` (auto by default).",
+    "--by": "The table has a row for each K. Differences between K or policies: mikasa-vla compare RUN --by "
+    "n_action_steps (or policy).",
+    "--config": "The configuration comes without a flag: mikasa-vla eval configs/mine.yaml.",
+    "--lr": "Learning rates are fields of the recipe.",
+}
+"""Flag -> what helps where no verb's flag does, or beside it."""
+WORDS: Mapping[str, str] = {
+    "tex": "latex",
+    "md": "markdown",
+    "table": "markdown",
+    "k": "n_action_steps",
+    "n-action-steps": "n_action_steps",
+    "policies": "policy",
+}
+"""Word, in small letters -> choice that is meant."""
+
+
+def about_flag(flag: str, known: Collection[str]) -> str:
+    """Return what to say of a flag that a verb has not."""
+    meant = next((one for one in MEANT.get(flag, ()) if one in known), None)
+    told = f" {TOLD[flag]}" if flag in TOLD and (meant is None or meant == "--set") else ""
+    if meant is not None:
+        return f" Did you mean '{meant}'?{told}"
+    return told or did_you_mean(flag, known)
+
+
+def about_choice(value: object, choices: Iterable[object]) -> str:
+    """Return a suggestion for a word that is none of the choices."""
+    known = [str(one) for one in choices]
+    meant = WORDS.get(str(value).lower())
+    return f" Did you mean '{meant}'?" if meant in known else did_you_mean(str(value), known)
+
+
+def about_empty(arguments: Sequence[str]) -> str | None:
+    """Return what is wrong if an argument is empty, as that of a shell variable that is not set."""
+    for index, text in enumerate(arguments):
+        flag, equals, value = text.partition("=")
+        is_flag = flag.startswith("--")
+        if (text == "" or (is_flag and equals and not value)) and flag != "--set":
+            before = [one for one in arguments[:index] if one.startswith("--")]
+            name = flag if is_flag else before[-1] if before else "an argument"
+            return (
+                f"{name}: expected a value, found empty text. If a shell variable stands there, it is not "
+                'set, or empty: `echo "$NAME"` shows it.'
+            )
+    return None
+
+
+class Numbers(argparse.Action):
+    """Reads numbers that are separated by blanks or commas: `1 4 8`, `1,4,8` and `1, 4, 8`."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
+        """Add the numbers to those of the flag before."""
+        found = [number for one in values for number in one] if isinstance(values, list) else []
+        given = getattr(namespace, self.dest, None)
+        earlier = given if isinstance(given, list) and given is not self.default else []
+        setattr(namespace, self.dest, [*earlier, *found])
+
+
+def numbers(text: str) -> list[int]:
+    """Read one or several numbers; a comma at the end is that of `1, 4, 8`."""
+    parts = text.removesuffix(",").split(",")
+    try:
+        return [int(part) for part in parts]
+    except ValueError as exc:
+        raise argparse.ArgumentTypeError(f"expected whole numbers such as 1 4 8, found '{text}'") from exc
