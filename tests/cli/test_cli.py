@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from vla_eval.cli.main import VERBS, build_parser, main
-from vla_eval.cli.show import task_arguments
 from vla_eval.config.files import list_recipes
 from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.source import task_arguments
 
 HEAVY = ("torch", "sapien", "mani_skill", "gymnasium", "lerobot", "cv2", "rerun", "transformers")
 
@@ -179,7 +179,7 @@ class TestShow:
     def test_arguments_are_those_of_the_row_of_its_class_and_of_its_bases(
         self, capsys: pytest.CaptureFixture[str]
     ) -> None:
-        names = [argument.name for argument in task_arguments(task_spec("RememberColor5-v0"))]
+        names = [argument.name for argument in task_arguments(task_spec("RememberColor5-v0").entry_point)]
         _, out, _ = run(capsys, "show", "RememberColor5-v0")
 
         assert {"n_items", "strict_choice", "cue_steps", "freeze_until_choice"} <= set(names)

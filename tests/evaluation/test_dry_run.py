@@ -121,7 +121,7 @@ class TestRefusals:
     CHANGES: tuple[dict[str, Any], ...] = (
         {"seed_start": 7},
         {"episodes": 1},
-        {"env": {"horizon_steps": 9}},
+        {"env": {"horizon_steps": 29}},
         {"cue_view": "first_frame"},
         {"runs": 1, "n_action_steps": (1,)},
     )
@@ -183,7 +183,7 @@ def test_each_policy_is_read_once_and_a_server_asked_once(
 
     monkeypatch.setattr(entries, "load_policy_recipe", counted)
     arguments = ["--task", "RememberColor3-v0", "--policy", "memory_color3", "random", "--episodes", "1"]
-    arguments += ["--set", "simulator=fake", "--set", "env.horizon_steps=4", "--out", str(tmp_path / "out")]
+    arguments += ["--set", "simulator=fake", "--set", "env.horizon_steps=12", "--out", str(tmp_path / "out")]
     for more in (["--dry-run"], ["--workers", "1"]):
         read.clear()
         assert main(["eval", *arguments, *more]) == 0

@@ -28,13 +28,14 @@ from vla_eval.training.finetune import finetune
 
 TASK = "RememberColor3-v0"
 PLUGIN = Path(__file__).parents[2] / "plugins" / "lerobot_env_mikasa"
+SHORT = {"cue_steps": 1, "delay_steps": 1}
 FAKE = EnvSettings(
-    task=TASK, kwargs={"horizon_steps": 4}, simulator="fake", cameras=("base_camera", "hand_camera")
+    task=TASK, kwargs={"horizon_steps": 4, **SHORT}, simulator="fake", cameras=("base_camera", "hand_camera")
 )
 HOLD = np.array([0, 0, 0, 0, 0, 0, 1], dtype=np.float32)
 ENV_ARGUMENTS = [
     *("--env.type=mikasa", f"--env.task={TASK}", "--env.simulator=fake"),
-    "--env.env_kwargs={horizon_steps: 2}",
+    "--env.env_kwargs={horizon_steps: 2, cue_steps: 1, delay_steps: 0}",
 ]
 TINY_ACT = [
     *("--policy.type=act", "--policy.device=cpu", "--policy.push_to_hub=false"),
@@ -132,7 +133,7 @@ class TestEpisodes:
         assert len(set(pictures(make_gym()))) == 3
 
     def test_a_finished_episode_stays_finished_until_the_next_rollout(self) -> None:
-        config = MikasaEnvConfig(task=TASK, simulator="fake", env_kwargs={"horizon_steps": 3})
+        config = MikasaEnvConfig(task=TASK, simulator="fake", env_kwargs={"horizon_steps": 3, **SHORT})
         (vector,) = config.create_envs(2)["mikasa"].values()
         vector.reset(seed=[1, 2], options={NEW_ROLLOUT_OPTION: True})
         actions = np.stack([HOLD, HOLD])

@@ -72,7 +72,7 @@ class TestToyFamily:
         monkeypatch.setattr(evaluate_module, "RUNNER", f"{toy.__name__}:toy_runner")
         out = tmp_path / "evaluation"
         evaluation = ["eval", "--task", "RememberColor3-v0", "--policy", str(run), "--workers", "1"]
-        evaluation += ["--episodes", "2", "--set", "simulator=fake", "--set", "env.horizon_steps=6"]
+        evaluation += ["--episodes", "2", "--set", "simulator=fake", "--set", "env.horizon_steps=12"]
         assert main([*evaluation, "--out", str(out)]) == 0
         assert [(record.policy, record.error) for record in read_run(out).records] == [
             ("run-000003", None),

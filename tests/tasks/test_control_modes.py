@@ -14,8 +14,8 @@ from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameErr
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_oracle
 from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import env_spec
 from vla_eval.testing.check_env import check_env
 
 TASK = "RememberColor3-v0"
@@ -34,7 +34,7 @@ def test_names_and_bounds_of_an_action_are_those_of_the_simulator_s_controller(m
         env.spec.action.high
     )
     assert len(env.spec.action.dims) == space.shape[0]
-    assert env.spec == env_spec(task_spec(TASK), control_mode=mode)
+    assert env.spec == offered_by(task_spec(TASK), {"control_mode": mode})
 
 
 @pytest.mark.parametrize("mode", MODES[1:])

@@ -34,7 +34,10 @@ from vla_eval.training.finetune import finetune
 tokenizer = tiny_trainings.tokenizer
 
 LOOK, FOLLOW = "look, wait, choose", "follow the ball"  # of the fixture `recorded`, in turn
-FAKE = ["--set", "simulator=fake", "--set", "env.horizon_steps=6", "--workers", "2", "--episodes", "2"]
+FAKE = [
+    *("--set", "simulator=fake", "--set", "env.horizon_steps=6", "--set", "env.delay_steps=0"),
+    *("--workers", "2", "--episodes", "2"),
+]
 WORDS = {"width": 16, "heads": 2, "layers": 1, "context_steps": 20, "chunk_size": 3, "n_action_steps": 2}
 HELD_OUT = HeldOutConfig(every_steps=2, episodes=1, simulator="fake")
 OTHER, PERMUTED = "red before blue", "blue before red"
@@ -263,7 +266,9 @@ class TestCutSentences:
         config = dataclasses.replace(
             config,
             finetune={**config.finetune, "policy": policy, "batch_size": 16},
-            held_out=dataclasses.replace(HELD_OUT, env={"horizon_steps": 6}, workers=1, task=TASK),
+            held_out=dataclasses.replace(
+                HELD_OUT, env={"horizon_steps": 6, "delay_steps": 0}, workers=1, task=TASK
+            ),
         )
         monkeypatch.setattr(evaluate_module, "RUNNER", TINY_RUNNER)
         lines: list[str] = []

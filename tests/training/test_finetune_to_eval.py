@@ -21,7 +21,7 @@ from vla_eval.testing.tiny_models import (
 
 TASK = "RememberColor3-v0"
 SHORT = {"steps": 2, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
-FAKE = ["--set", "simulator=fake", "--set", "env.horizon_steps=6"]
+FAKE = ["--set", "simulator=fake", "--set", "env.horizon_steps=6", "--set", "env.delay_steps=0"]
 
 
 @pytest.fixture(autouse=True)

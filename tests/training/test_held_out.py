@@ -34,7 +34,12 @@ TINY_ACT = {
 }
 SHORT = {"steps": 4, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
 ON_FAKE = HeldOutConfig(
-    every_steps=2, episodes=3, simulator="fake", env={"horizon_steps": 8}, workers=1, n_action_steps=2
+    every_steps=2,
+    episodes=3,
+    simulator="fake",
+    env={"horizon_steps": 8, "delay_steps": 1},
+    workers=1,
+    n_action_steps=2,
 )
 
 

@@ -4,11 +4,7 @@ The task's source is read, not imported: importing it would start a simulator.
 """
 
 import argparse
-import ast
 import textwrap
-from collections.abc import Iterator, Sequence
-from functools import cache
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,17 +17,16 @@ from vla_eval.config.protocol import Protocol
 from vla_eval.errors import unknown_name
 from vla_eval.evaluation.model_table import ModelTable, is_model_table
 from vla_eval.tasks.catalog import FAMILIES, TASKS, find_task, installed_tasks, task_spec
+from vla_eval.tasks.source import TaskArgument, task_arguments
 from vla_eval.tasks.spec import PhaseSource, TaskSpec
 
 WIDTH = 100
 INDENT = 14
-SIMULATOR = "mani_skill"  # to look for one of its modules would import it
 OFFICIAL_PHASES: dict[PhaseSource, str] = {
     "cue_and_delay": "cue, delay, response; lengths as the package has or draws them",
     "cue": "cue, response; lengths as the package has or draws them",
     "none": "— (not to be read from the environment)",
 }
-NOT_FOR_USERS = ("instruction", "reconfiguration_freq")  # chosen by other options or not at all
 
 
 _RecipeClass = type[PolicyRecipe | EvalConfig | ModelTable | DatasetRecipe | Protocol]
@@ -51,14 +46,6 @@ KINDS: dict[Folder, _Kind] = {
     "datasets": _Kind("dataset", DatasetRecipe, "mikasa-vla record {name}"),
     "protocols": _Kind("protocol", Protocol, "mikasa-vla eval --protocol {name} --policy POLICY"),
 }
-
-
-class TaskArgument(NamedTuple):
-    """One keyword argument of a task's class, as its source has it."""
-
-    name: str
-    default: str | None  # None: it has to be given
-    origin: str  # the class that takes it
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
@@ -92,7 +79,7 @@ def run(args: argparse.Namespace) -> int:
     _print("success", spec.success)
     _print("chance", _chance(spec))
     _print("horizon", _horizon(spec))
-    arguments = {argument.name: argument for argument in task_arguments(spec)}
+    arguments = {argument.name: argument for argument in task_arguments(spec.entry_point)}
     _print("phases", _phases(spec, arguments))
     _print("oracle", spec.oracle)
     _print(
@@ -104,8 +91,6 @@ def run(args: argparse.Namespace) -> int:
         default = spec.kwargs.get(argument.name, argument.default)
         if argument.name in spec.open_arguments:
             default = "… (must be given)"
-        if default is None:  # given by a class to its base, not by a user
-            continue
         print(f"{'':{INDENT}}{argument.name} = {default}  ({argument.origin})")
     return 0
 
@@ -196,66 +181,3 @@ def _in_turn(spec: TaskSpec, phase: str) -> str:
     if phase != "cue" or not spec.shows_one_by_one:
         return ""
     return f"{spec.kwargs.get('n_shown', 'n_shown')} × "
-
-
-def task_arguments(spec: TaskSpec) -> Iterator[TaskArgument]:
-    """Yield the keyword arguments of the task's class and of its bases, nearest first."""
-    module_name, _, class_name = spec.entry_point.partition(":")
-    seen: set[str] = set(NOT_FOR_USERS)
-    for origin, node in _classes(module_name, class_name):
-        for init in node.body:
-            if not isinstance(init, ast.FunctionDef) or init.name != "__init__":
-                continue
-            for argument, default in zip(init.args.kwonlyargs, init.args.kw_defaults, strict=True):
-                if argument.arg not in seen:
-                    seen.add(argument.arg)
-                    value = _value(origin, default) if default else None
-                    yield TaskArgument(argument.arg, value, node.name)
-
-
-class _Module(NamedTuple):
-    """What a module says."""
-
-    body: Sequence[ast.stmt]
-    imported: dict[str, tuple[str, str]]  # name here -> module, name there
-
-
-@cache
-def _module(name: str) -> _Module:
-    found = None if name.partition(".")[0] == SIMULATOR else find_spec(name)
-    if found is None or found.origin is None or not found.origin.endswith(".py"):
-        return _Module([], {})
-    tree = ast.parse(Path(found.origin).read_text(encoding="utf-8"))
-    imported = {
-        alias.asname or alias.name: (node.module or "", alias.name)
-        for node in ast.walk(tree)
-        if isinstance(node, ast.ImportFrom)
-        for alias in node.names
-    }
-    return _Module(tree.body, imported)
-
-
-def _classes(module_name: str, class_name: str) -> Iterator[tuple[str, ast.ClassDef]]:
-    """Yield a class and its bases below ManiSkill's, each with its module's name, from their source."""
-    module = _module(module_name)
-    for node in module.body:
-        if not isinstance(node, ast.ClassDef) or node.name != class_name:
-            continue
-        yield module_name, node
-        for base in node.bases:
-            name = ast.unparse(base)
-            yield from _classes(*module.imported.get(name, (module_name, name)))
-
-
-def _value(module_name: str, expression: ast.expr) -> str:
-    """Return an expression's text; for the name of a constant that of its value."""
-    if not isinstance(expression, ast.Name):
-        return ast.unparse(expression)
-    name, module = expression.id, _module(module_name)
-    if name in module.imported:
-        other, name = module.imported[name]
-        return _value(other, ast.Name(name))
-    for node in module.body:
-        if isinstance(node, ast.Assign) and name in (ast.unparse(target) for target in node.targets):
-            return _value(module_name, node.value)
-    return name

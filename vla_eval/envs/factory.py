@@ -9,10 +9,14 @@ from typing import cast
 
 from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.core import SimEnv
+from vla_eval.envs.fake import FakeEnv
+from vla_eval.envs.official_settings import check_official
 from vla_eval.errors import MissingDependencyError, unknown_name
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.specs import EnvSpec
+from vla_eval.tasks.arguments import check_arguments, offered_by, robot_uid
+from vla_eval.tasks.catalog import TASKS, task_spec
 
-__all__ = ["EnvSettings", "RenderSettings", "describe_device", "make_env"]
+__all__ = ["EnvSettings", "RenderSettings", "describe_device", "describe_env", "make_env"]
 
 SIMULATORS = {
     "maniskill": "vla_eval.envs.maniskill:ManiSkillEnv",
@@ -47,6 +51,24 @@ def make_env(settings: EnvSettings) -> SimEnv:
         ) from exc
     factory = cast("Callable[[EnvSettings], SimEnv]", getattr(module, attribute))
     return factory(settings)
+
+
+def describe_env(settings: EnvSettings) -> EnvSpec:
+    """Return what the environment of these settings offers to a policy, without starting a simulator.
+
+    Raises:
+        TaskArgumentError: the task does not take these arguments, or not together.
+        UnknownNameError: there is no such argument, arm or control mode.
+    """
+    if settings.simulator == "fake":
+        return FakeEnv(settings).spec  # arrays only
+    task = task_spec(settings.task)
+    if task.is_official:
+        check_official(settings, task)
+    else:
+        check_arguments(task, settings.kwargs, TASKS.values())
+        robot_uid(settings.kwargs, wrist_mesh=settings.render.wrist_mesh)
+    return offered_by(task, settings.kwargs)
 
 
 def describe_device(env: SimEnv) -> Mapping[str, str] | None:

@@ -20,9 +20,9 @@ from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus, only_one
+from vla_eval.tasks.arguments import check_argument, check_arguments
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.interface import ACTION, CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.objects.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec, chance_of_several

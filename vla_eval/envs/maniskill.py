@@ -6,9 +6,8 @@ vectorised environment, in which slots without an action hold still. ManiSkill i
 """
 
 import gc
-import inspect
 from collections.abc import Mapping
-from typing import Any, get_type_hints  # ManiSkill is untyped: its environments and infos are Any here
+from typing import Any  # ManiSkill is untyped: its environments and infos are Any here
 
 import numpy as np
 import torch
@@ -19,21 +18,14 @@ from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes
 from vla_eval.envs.cue_location import boxes_of_cue
 from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
-from vla_eval.errors import TaskArgumentError, check_names
+from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.appearance import with_appearance
-from vla_eval.tasks.arm.arms import ARMS
-from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
+from vla_eval.tasks.arguments import ROBOT, check_arguments, horizon_steps, robot_uid
 from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.families import check_argument, check_arguments
 from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
-from vla_eval.tasks.memory_env import MemoryTableEnv
 from vla_eval.tasks.register import env_class
-from vla_eval.tasks.spec import TaskSpec
-
-ROBOT = "robot_uids"
-
 
 # ManiSkill collects garbage whenever it rebuilds a scene, which our tasks do at each reset. With all objects
 # of the imported modules this takes 150 ms; once frozen, they cost nothing.
@@ -55,7 +47,6 @@ class ManiSkillEnv:
         check_arguments(row, settings.kwargs, TASKS.values())
         kwargs = {**row.kwargs, **settings.kwargs}
         wanted_steps = kwargs.pop("horizon_steps", None)
-        _check_arguments(env_class(row), kwargs, row.id, given=settings.kwargs)
         check_names("camera", settings.cameras, CAMERA_NAMES, where=row.id)
         action = action_spec(control_mode_of(kwargs))
         self._settings = settings
@@ -70,7 +61,7 @@ class ManiSkillEnv:
             cameras=cameras(kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX)),
             states=states(self._envs[0].arm.joints, env_class(row).PROMPT_DIMS),
             action=action,
-            horizon_steps=_horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
+            horizon_steps=horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
             control_hz=CONTROL_HZ,
         )
         self.device = describe(self._envs[0], settings)
@@ -163,66 +154,11 @@ class ManiSkillEnv:
 
 
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:
-    robot, mode = _robot(settings, kwargs), control_mode_of(kwargs)
-    if robot in ARMS and mode not in ARMS[robot].control_modes:
-        raise TaskArgumentError(
-            f"{CONTROL_MODE}={mode!r} with {ROBOT}={robot!r}: this arm takes "
-            f"{', '.join(ARMS[robot].control_modes)}. Leave one of the two out."
-        )
+    robot = robot_uid(kwargs, wrist_mesh=settings.render.wrist_mesh)
     return build(
         with_appearance(cls, settings.appearance),
         settings,
         num_envs=num_envs,
         sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
-        **{**kwargs, ROBOT: robot, CONTROL_MODE: mode},
+        **{**kwargs, ROBOT: robot, CONTROL_MODE: control_mode_of(kwargs)},
     )
-
-
-def _robot(settings: EnvSettings, kwargs: Mapping[str, Any]) -> str:
-    """Return the requested arm, or the Panda with the requested mesh."""
-    mesh = settings.render.wrist_mesh
-    if ROBOT not in kwargs:
-        return WRIST_MESH_ROBOTS[mesh]
-    if mesh != "shipped" or kwargs[ROBOT] in WRIST_MESH_ROBOTS.values():
-        raise TaskArgumentError(
-            f"{ROBOT}={kwargs[ROBOT]!r} with render.wrist_mesh={mesh!r}: the mesh belongs to the Panda, the "
-            "default arm. Set only one of the two."
-        )
-    return str(kwargs[ROBOT])
-
-
-def _check_arguments(cls: Any, kwargs: Mapping[str, Any], task: str, *, given: Mapping[str, Any]) -> None:
-    """Raise unless every argument belongs to the task (not to ManiSkill's base class) and has its type.
-
-    Types are checked only for the user's arguments.
-    """
-    known: dict[str, Any] = {"horizon_steps": int}  # Any: type annotations
-    for ancestor in reversed(cls.__mro__):
-        if issubclass(ancestor, MemoryTableEnv):
-            parameters = inspect.signature(ancestor.__init__).parameters.values()
-            hints = get_type_hints(ancestor.__init__)
-            own = (p.name for p in parameters if p.kind is inspect.Parameter.KEYWORD_ONLY)
-            known.update({name: hints[name] for name in own})
-    # The instruction comes from the prompt set, an episode must not depend on earlier ones, and a task makes
-    # its items itself.
-    for name in ("instruction", "reconfiguration_freq", "items"):
-        known.pop(name, None)
-    check_names("argument", kwargs, known, where=task)
-    for name, value in given.items():
-        check_argument(known[name], value, name=name, task=task)
-
-
-def _horizon_steps(row: TaskSpec, longest_wait_steps: int, wanted: int | None) -> int:
-    """Return the length of an episode: as requested, or as in the row.
-
-    Raises:
-        TaskArgumentError: too short for a step of the choice.
-    """
-    horizon_steps = row.default_horizon_steps(longest_wait_steps) if wanted is None else wanted
-    if longest_wait_steps >= horizon_steps:
-        raise TaskArgumentError(
-            f"{row.id}: cue_steps and delay_steps can be {longest_wait_steps} together, but the episode ends "
-            f"after horizon_steps={horizon_steps}: no step is left for the choice. Increase horizon_steps or "
-            "shorten the phases."
-        )
-    return horizon_steps

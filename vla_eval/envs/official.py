@@ -15,24 +15,23 @@ from typing import Any  # ManiSkill and the package are untyped: environments, i
 import numpy as np
 import torch
 
-from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.envs.official_episode import OfficialEpisode, waiting_of
 from vla_eval.envs.official_mug import provide_mug
+from vla_eval.envs.official_settings import check_official
 from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
 from vla_eval.envs.true_states import with_true_states
 from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, check_names
 from vla_eval.oracles.arm_model import gripper_command
-from vla_eval.specs import EnvSpec
 from vla_eval.task_state import PrivilegedState
+from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import ACTION, CAMERAS, CONTROL_HZ, states
+from vla_eval.tasks.interface import ACTION, CAMERAS
 from vla_eval.tasks.spec import TaskSpec
 
 PACKAGE = "mikasa_robo_suite"
 ROBOT = "panda_wristcam"
-ARGUMENTS = ("horizon_steps", "mug")
 LARGEST_SEED = 2**32 - 1  # of numpy's RandomState, which ManiSkill draws from
 
 # See `maniskill.py`.
@@ -52,9 +51,8 @@ class OfficialEnv:
             RenderingError: cameras are wanted and the renderer does not start.
         """
         row = task_spec(settings.task)
-        check_names("argument", settings.kwargs, ARGUMENTS, where=row.id)
+        check_official(settings, row)
         check_names("camera", settings.cameras, [camera.name for camera in CAMERAS], where=row.id)
-        _check_possible(settings, row)
         cls = _adapted(official_class(row))
         self._row, self._settings = row, settings
         self.device: dict[str, str] = {}
@@ -63,14 +61,7 @@ class OfficialEnv:
         self._envs = [_build(cls, settings) for _ in range(settings.n_slots)]
         self._episodes: dict[int, OfficialEpisode] = {}
         self.device |= describe(self._envs[0], settings)
-        self.spec = EnvSpec(
-            task=row.id,
-            cameras=CAMERAS,
-            states=states(),
-            action=ACTION,
-            horizon_steps=settings.kwargs.get("horizon_steps", row.horizon_steps),
-            control_hz=CONTROL_HZ,
-        )
+        self.spec = offered_by(row, settings.kwargs)
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
         """Begin an episode in each of the given slots; see `SimEnv.reset`."""
@@ -167,23 +158,6 @@ def _adapted(cls: Any) -> Any:
         return {}
 
     return type(cls.__name__, (with_true_states(cls),), {"__module__": cls.__module__, "get_obs": get_obs})
-
-
-def _check_possible(settings: EnvSettings, row: TaskSpec) -> None:
-    asked = {
-        "sim_backend=gpu": settings.sim_backend == "gpu",
-        "appearance": settings.appearance != AS_DESIGNED,
-        f"render.wrist_mesh={settings.render.wrist_mesh}": settings.render.wrist_mesh == "simplified",
-    }
-    for what, is_asked in asked.items():
-        if is_asked:
-            raise TaskArgumentError(
-                f"{row.id}: {what}: the official environments run on the CPU simulator and look as they are. "
-                "Leave this setting out for them."
-            )
-    horizon_steps = settings.kwargs.get("horizon_steps", row.horizon_steps)
-    if not isinstance(horizon_steps, int) or isinstance(horizon_steps, bool) or horizon_steps < 1:
-        raise TaskArgumentError(f"{row.id}: horizon_steps={horizon_steps!r}: expected a number ≥ 1.")
 
 
 def _build(cls: Any, settings: EnvSettings) -> Any:

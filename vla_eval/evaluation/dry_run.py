@@ -1,11 +1,12 @@
 """`eval --dry-run`: what would run, and what it takes. Starts no worker and writes nothing."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.checkpoints.files import find_checkpoint, weights_file
+from vla_eval.envs.factory import describe_env
 from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.evaluation.evaluate import describe, worker_count
 from vla_eval.evaluation.job_queue import JobQueue
@@ -13,7 +14,6 @@ from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.evaluation.rendered import images_read, n_rendered
 from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.storage.run_folder import check_startable
-from vla_eval.tasks.catalog import task_spec
 
 N_CAMERAS = 2
 LEARNED = "checkpoint"  # the argument of adapters that load weights
@@ -80,7 +80,7 @@ def evaluation_effort(
     finished = frozenset(record.key for record in records if record.error is None)
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)
-    steps = [horizon_steps(job) for job in ahead]
+    steps = horizons(ahead)
     inferences = [
         math.ceil(n_steps / job.group.key.n_action_steps) for job, n_steps in zip(ahead, steps, strict=True)
     ]
@@ -138,10 +138,11 @@ def _lines(resolved: ResolvedEvaluation, effort: EvaluationEffort, rates: Assume
     )
 
 
-def horizon_steps(job: EpisodeJob) -> int:
-    """Return after how many control steps an episode ends at the latest."""
-    own = job.group.env.kwargs.get("horizon_steps")
-    return int(own) if own is not None else task_spec(job.group.key.task).horizon_steps
+def horizons(jobs: Sequence[EpisodeJob]) -> list[int]:
+    """Return after how many control steps each episode ends at the latest."""
+    groups = {id(job.group): job.group for job in jobs}
+    steps = {key: describe_env(group.env).horizon_steps for key, group in groups.items()}
+    return [steps[id(job.group)] for job in jobs]
 
 
 def _checkpoints(plan: Plan) -> dict[str, Path]:

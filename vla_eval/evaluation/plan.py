@@ -22,6 +22,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.cue_view import CueViewSettings
+from vla_eval.envs.factory import describe_env
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.resolve import ResolvedEvaluation, has_weights
@@ -32,8 +33,7 @@ from vla_eval.seeding import SeedRange
 from vla_eval.storage.shard import Shard
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.strict.bounds import MAX_EPISODES
-from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.families import check_arguments
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 from vla_eval.wire.metadata import ServerMetadata
 
@@ -107,8 +107,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
         RecipeError: a recipe is wrong, two policies have the same name, there are too many episodes, or more
             shards than blocks of episodes that stay together.
         MissingInstructionError: a task has no instruction in the prompt set.
-        TaskArgumentError: a family of tasks is named, but not which of its tasks; or an argument is for
-            tasks with candidates, and one of the tasks has none.
+        TaskArgumentError: see `describe_env`.
         CheckpointError: the weights that a recipe names are not there, or not whole.
     """
     config, policies = resolved.config, resolved.policies
@@ -168,7 +167,7 @@ def _groups_of_all(
     groups: list[EpisodeGroup] = []
     left_out: list[str] = []
     for task in tasks:
-        check_arguments(task, config.env, TASKS.values())
+        describe_env(_env_settings(config, task))
         instruction = sentences_of(prompts, task)[0]
         for policy in policies:
             check_adapter(policy.value.adapter)
@@ -179,6 +178,18 @@ def _groups_of_all(
             server = servers.get(policy.name)
             groups.extend(_groups(config, task, policy, instruction, server, n_rows=n_rows))
     return groups, left_out
+
+
+def _env_settings(config: EvalConfig, task: TaskSpec) -> EnvSettings:
+    return EnvSettings(
+        task=task.id,
+        kwargs=config.env,
+        simulator=config.simulator,
+        sim_backend=config.sim_backend,
+        render=config.render,
+        appearance=config.appearance,
+        n_slots=config.slots_per_worker,
+    )
 
 
 def _jobs(config: EvalConfig, group: EpisodeGroup) -> Iterable[EpisodeJob]:
@@ -314,15 +325,7 @@ def _groups(
             key=GroupKey(task.id, policy.name, n_action_steps),
             adapter=recipe.value.adapter,
             args=args,
-            env=EnvSettings(
-                task=task.id,
-                kwargs=config.env,
-                simulator=config.simulator,
-                sim_backend=config.sim_backend,
-                render=config.render,
-                appearance=config.appearance,
-                n_slots=config.slots_per_worker,
-            ),
+            env=_env_settings(config, task),
             rollout=RolloutSettings(
                 chunking=config.chunking.at(n_action_steps),
                 eager_rendering=config.eager_rendering,

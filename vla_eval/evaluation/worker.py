@@ -15,12 +15,13 @@ from typing import NamedTuple
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, Policy, SimEnv, StepObserver, StepResult
-from vla_eval.envs.factory import describe_device, make_env
+from vla_eval.envs.factory import describe_device, describe_env, make_env
 from vla_eval.errors import (
     InvalidActionError,
     RemoteConnectionError,
     RemoteReplyError,
     RemoteTimeoutError,
+    SpecMismatchError,
     VlaEvalError,
 )
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
@@ -96,7 +97,6 @@ class EpisodeRunner:
         self._heartbeat = heartbeat
         self._tell = tell
         self._env: SimEnv | None = None
-        self._env_settings: EnvSettings | None = None
         self._policy: Policy | None = None
         self._n_told = 0  # sentences that the parent knows of
 
@@ -120,7 +120,7 @@ class EpisodeRunner:
         """Release the simulator."""
         if self._env is not None:
             self._env.close()
-        self._env = self._env_settings = self._policy = None
+        self._env = self._policy = None
 
     def _run(self, env: SimEnv, policy: Policy, batch: EpisodeBatch) -> Finished:
         group = batch.group
@@ -159,24 +159,19 @@ class EpisodeRunner:
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group
         if self._env is None or self._policy is None:
-            # Privileged, as scripted controls need it: theirs is then already made.
-            spec = self._make_env(dataclasses.replace(group.env, privileged=True)).spec
-            facts = EnvFacts(spec, task_spec(group.env.task).n_candidates(group.env.kwargs))
-            self._heartbeat("setup")
+            facts = EnvFacts(
+                describe_env(group.env), task_spec(group.env.task).n_candidates(group.env.kwargs)
+            )
             if self._capture is not None:
                 self._capture.load()
             policy = make_policy(group, facts)
             check_compatible(policy.spec, facts.spec)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
             self._heartbeat("setup")
-            settings = self._settings_for(group, policy, facts)
-            self._close_other(settings)
-            if self._env is None:
-                # ManiSkill collects garbage at each reset, through all that the policy's libraries imported.
-                gc.freeze()
-            env = self._make_env(settings)
+            # ManiSkill collects garbage at each reset, through all that the policy's libraries imported.
+            gc.freeze()
+            self._env = self._make_env(self._settings_for(group, policy, facts), facts.spec)
             self._policy = policy
-            return env, policy
         return self._env, self._policy
 
     def _settings_for(self, group: EpisodeGroup, policy: Policy, facts: EnvFacts) -> EnvSettings:
@@ -192,20 +187,18 @@ class EpisodeRunner:
             human_camera_stride=self._capture.config.frame_stride,
         )
 
-    def _close_other(self, settings: EnvSettings) -> None:
-        if self._env is not None and self._env_settings != settings:
-            self._env.close()
-            self._env = self._env_settings = None
-
-    def _make_env(self, settings: EnvSettings) -> SimEnv:
-        self._close_other(settings)
-        if self._env is None:
-            self._env = make_env(settings)
-            self._env_settings = settings
-            device = describe_device(self._env)
-            if device is not None:
-                self._tell(DeviceFound(device=device))
-        return self._env
+    def _make_env(self, settings: EnvSettings, described: EnvSpec) -> SimEnv:
+        env = make_env(settings)
+        if env.spec != described:
+            raise SpecMismatchError(
+                f"{settings.task}: expected an environment as row and arguments describe it, {described}; "
+                f"found {env.spec}. The policy was made for the first. If the task is of another package: "
+                "its class must not change what `vla_eval.tasks.arguments.offered_by` reads."
+            )
+        device = describe_device(env)
+        if device is not None:
+            self._tell(DeviceFound(device=device))
+        return env
 
 
 def make_policy(group: EpisodeGroup, facts: EnvFacts) -> Policy:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from vla_eval.config.environment import EnvSettings, RenderSettings, WristMesh
 from vla_eval.config.prompts import instruction_for
 from vla_eval.core import SimEnv, StepResult
-from vla_eval.envs.factory import make_env
+from vla_eval.envs.factory import describe_env, make_env
 from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
 from vla_eval.features import (
     ACTION_KEY,
@@ -31,8 +31,8 @@ from vla_eval.features import (
     proprioception,
 )
 from vla_eval.specs import EnvSpec
+from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import offered_by
 
 SLOT = 0  # one episode at a time; LeRobot makes a vector of such environments
 PIXELS, AGENT_POS = "pixels", "agent_pos"
@@ -68,8 +68,8 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         self._result: StepResult | None = None
         self.task = row.id
         self.task_description = instruction_for(row, prompt_set)
-        offered = offered_by(row, settings.kwargs)
-        self._max_episode_steps = int(settings.kwargs.get("horizon_steps", row.horizon_steps))
+        offered = describe_env(settings)
+        self._max_episode_steps = offered.horizon_steps
         self.render_mode = "rgb_array"
         image = gym.spaces.Box(0, 255, _image_shape(offered), np.uint8)
         self.observation_space = gym.spaces.Dict(

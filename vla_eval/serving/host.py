@@ -14,6 +14,7 @@ from vla_eval.checkpoints.notes import LEROBOT_ADAPTER, checkpoint_hashes, train
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.policy import PolicyRecipe
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import BatchPolicy, Policy
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.features import IMAGE_SIZE_PX
@@ -30,8 +31,9 @@ from vla_eval.serving.observations import (
 from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.storage.provenance import PACKAGES, package_version
 from vla_eval.strict.bounds import MAX_SERVER_ROWS, MAX_STEPS, check_bounds
+from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import ANY_TASK, env_spec
+from vla_eval.tasks.interface import ANY_TASK, IMAGE_SIZE, env_spec
 from vla_eval.wire.metadata import PROTOCOL, SUPPORTS, ServerMetadata
 
 OWN_PACKAGE = "mikasa-vla-eval"
@@ -119,10 +121,12 @@ def _environment(recipe: Recipe[PolicyRecipe], options: HostOptions) -> EnvSpec:
     is_ours = recipe.value.adapter == LEROBOT_ADAPTER and isinstance(checkpoint, str)
     facts = read_facts(find_checkpoint(Path(checkpoint))) if is_ours and checkpoint else None
     if facts is None:
-        return env_spec(task)
+        return env_spec() if task is None else offered_by(task, {})
     sizes_px = {shape[0] for shape in facts.images.values()}
     size_px = sizes_px.pop() if len(sizes_px) == 1 else IMAGE_SIZE_PX
-    return env_spec(task, control_mode=facts.control_mode, image_size_px=size_px)
+    if task is None:
+        return env_spec(control_mode=facts.control_mode, image_size_px=size_px)
+    return offered_by(task, {CONTROL_MODE: facts.control_mode, IMAGE_SIZE: size_px})
 
 
 def _make(recipe: Recipe[PolicyRecipe], options: HostOptions, env: EnvSpec) -> Policy:

@@ -12,6 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import get_args
 
 from vla_eval.errors import PluginError, UnknownNameError, unknown_name
+from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.catalogs.official_catalog import (
     MIKASA_VLA_90,
     NAMESPACE_90,
@@ -46,6 +47,7 @@ def _remember(family: str, number: str, kwargs: dict[str, int], what: str) -> Ta
         candidate_counts=kwargs,
         chance_success=1 / math.prod(kwargs.values()),
         max_reward=3.0,
+        other_arms=(FETCH_UID,),
     )
 
 

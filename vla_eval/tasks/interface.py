@@ -3,16 +3,15 @@
 Knows nothing of simulators: a server of policies has none.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
-from vla_eval.control_modes import EE_DELTA_POSE, action_spec, control_mode_of
+from vla_eval.control_modes import EE_DELTA_POSE, action_spec
 from vla_eval.errors import TaskArgumentError
 from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES, POSE_NAMES
 from vla_eval.specs import CameraSpec, EnvSpec, StateSpec
 from vla_eval.strict.bounds import MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
-from vla_eval.tasks.spec import TaskSpec
 
 IMAGE_SIZE = "image_size"
 """Name of the argument in `env`: height and width of the images of both cameras, in pixels."""
@@ -42,13 +41,13 @@ StepRange = int | Sequence[int]
 """A duration in control steps, or a range to draw from per episode."""
 
 
-def step_range(name: str, value: StepRange) -> tuple[int, int]:
+def step_range(name: str, value: object) -> tuple[int, int]:
     """Return (least, most) of a duration in control steps given as a number or as a pair.
 
     Raises:
         TaskArgumentError: not a whole number ≥ 0, nor a pair of such numbers in order.
     """
-    pair = (value, value) if isinstance(value, int) else tuple(value)
+    pair = tuple(value) if isinstance(value, list | tuple) else (value, value)
     if len(pair) != 2 or not all(isinstance(v, int) and v >= 0 for v in pair) or pair[0] > pair[1]:
         raise TaskArgumentError(
             f"{name}={value!r}: expected a number of control steps ≥ 0, or a pair (least, most) of them."
@@ -79,13 +78,10 @@ def states(joints: tuple[str, ...] = JOINT_NAMES, prompt_dims: tuple[str, ...] =
     return (*offered, StateSpec(name="task_cue", dims=prompt_dims, unit="rad", frame="world"))
 
 
-def env_spec(
-    task: TaskSpec | None = None, *, control_mode: str = EE_DELTA_POSE, image_size_px: int = IMAGE_SIZE_PX
-) -> EnvSpec:
-    """Return what a task offers with the Panda, without making its environment.
+def env_spec(*, control_mode: str = EE_DELTA_POSE, image_size_px: int = IMAGE_SIZE_PX) -> EnvSpec:
+    """Return what all tasks have in common with the Panda, with an episode of one step.
 
     Args:
-        task: its row in the catalogue; None: what all tasks have in common, with an episode of one step.
         control_mode: what an action means.
         image_size_px: height and width of images.
 
@@ -93,21 +89,10 @@ def env_spec(
         UnknownNameError: there is no such control mode.
     """
     return EnvSpec(
-        task=ANY_TASK if task is None else task.id,
+        task=ANY_TASK,
         cameras=cameras(image_size_px),
         states=states(),
         action=action_spec(control_mode),
-        horizon_steps=1 if task is None else task.default_horizon_steps(0),
+        horizon_steps=1,
         control_hz=CONTROL_HZ,
     )
-
-
-def offered_by(task: TaskSpec, env_kwargs: Mapping[str, object]) -> EnvSpec:
-    """Return what a task offers with these arguments, without making its environment.
-
-    Raises:
-        TaskArgumentError: the image size is impossible.
-        UnknownNameError: there is no such control mode.
-    """
-    size_px = checked_image_size(env_kwargs.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=task.id)
-    return env_spec(task, control_mode=control_mode_of(env_kwargs), image_size_px=size_px)

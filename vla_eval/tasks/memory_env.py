@@ -25,9 +25,9 @@ from vla_eval.errors import TaskArgumentError, unknown_name
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
+from vla_eval.tasks.arm import fetch, robots  # noqa: F401  importing them registers the arms
 from vla_eval.tasks.arm.arm_control import ArmControl
-from vla_eval.tasks.arm.arms import ARMS, Arm
-from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
+from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS, Arm
 from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, checked_image_size, step_range
 from vla_eval.tasks.objects.bodies import Body, to_vector
 

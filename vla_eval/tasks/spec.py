@@ -67,6 +67,7 @@ class TaskSpec:
         idle_success: measured success rate of doing nothing; 0 for all tasks but a few.
         cue_marks_place: the cue is shown where the right candidate will be.
         shows_one_by_one: the cue is `n_shown` items one after another, each for `cue_steps`.
+        other_arms: values of `robot_uids` that it takes in addition to the Panda's.
         open_arguments: arguments required to make a task of this row; empty except for a family.
         suite: the set of tasks that it belongs to.
         instruction: its sentence where no prompt set has one under `instruction_key`; a word in braces is
@@ -99,6 +100,7 @@ class TaskSpec:
     idle_success: float = 0.0
     cue_marks_place: bool = False
     shows_one_by_one: bool = False
+    other_arms: tuple[str, ...] = ()
     open_arguments: tuple[str, ...] = ()
     suite: Suite = "paper"
     instruction: str | None = None

@@ -24,8 +24,9 @@ from vla_eval.evaluation.evaluate import EvaluationObserver, evaluate
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.results.estimates import wilson_interval
 from vla_eval.storage.run_folder import read_run
+from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import env_spec, offered_by
+from vla_eval.tasks.interface import env_spec
 from vla_eval.training.run_folder import whole_checkpoints
 
 if TYPE_CHECKING:  # it imports lerobot; a finished training is known without

@@ -85,7 +85,7 @@ def test_it_is_trained_without_rotation_and_refused_in_another_mode(
     context = PolicyContext(name="p", env=env, chunking=ChunkingSpec(n_action_steps=2), n_candidates=3)
     with pytest.raises(SpecMismatchError, match=f"control mode: expected {EE_DELTA_POS}"):
         make_lerobot(context, checkpoint=str(folder))
-    context = replace(context, env=env_spec(None, control_mode=EE_DELTA_POS, image_size_px=128))
+    context = replace(context, env=env_spec(control_mode=EE_DELTA_POS, image_size_px=128))
     assert make_lerobot(context, checkpoint=str(folder)).spec.reads == "every"
 
 

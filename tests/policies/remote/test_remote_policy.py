@@ -27,12 +27,13 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.wire.metadata import ServerMetadata
 
+SHORT = {"horizon_steps": 8, "delay_steps": 1}
 TASK = "RememberColor3-v0"
 IMAGE = {"base_camera": {"key": "observation/image"}}
 
 
 def make_env(n_slots: int = 1, cameras: tuple[str, ...] = ()) -> FakeEnv:
-    return FakeEnv(EnvSettings(task=TASK, kwargs={"horizon_steps": 8}, n_slots=n_slots, cameras=cameras))
+    return FakeEnv(EnvSettings(task=TASK, kwargs=SHORT, n_slots=n_slots, cameras=cameras))
 
 
 @contextlib.contextmanager

@@ -21,6 +21,7 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.remote.policy import RemotePolicy, make_remote
 from vla_eval.rollout import RolloutSettings, rollout
 
+SHORT = {"horizon_steps": 8, "delay_steps": 1}
 TASK = "RememberColor3-v0"
 CAMERAS = ("base_camera", "hand_camera")
 
@@ -29,7 +30,7 @@ def run(name: str, handler: Callable[[ServerConnection], None], *, n_slots: int 
     """Run episodes of eight steps with a shipped recipe; returns their records."""
     recipe = load_recipe("policies", name, PolicyRecipe).value
     chunking = ChunkingSettings().at(recipe.default_n_action_steps)
-    env = FakeEnv(EnvSettings(task=TASK, kwargs={"horizon_steps": 8}, cameras=CAMERAS, n_slots=n_slots))
+    env = FakeEnv(EnvSettings(task=TASK, kwargs=SHORT, cameras=CAMERAS, n_slots=n_slots))
     context = PolicyContext(name=name, env=env.spec, chunking=chunking, n_candidates=3, n_slots=n_slots)
     starts = [
         EpisodeStart(slot=slot, task=TASK, seed=slot, run=0, instruction="touch it", horizon_steps=8)

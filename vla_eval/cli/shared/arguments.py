@@ -125,10 +125,13 @@ def env_paths(overrides: Sequence[str]) -> dict[str, list[str]]:
     """Return `delay_steps` -> `env.delay_steps` of all arguments of tasks, for messages about `--set`."""
     if not overrides:
         return {}
-    from vla_eval.cli.show import task_arguments
     from vla_eval.tasks.catalog import TASKS
+    from vla_eval.tasks.source import task_arguments
 
-    names = ["horizon_steps", *(one.name for task in TASKS.values() for one in task_arguments(task))]
+    names = [
+        "horizon_steps",
+        *(one.name for task in TASKS.values() for one in task_arguments(task.entry_point)),
+    ]
     return {name: [f"env.{name}"] for name in names}
 
 

@@ -12,7 +12,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vla_eval.evaluation.dry_run import horizon_steps
+from vla_eval.evaluation.dry_run import horizons
 from vla_eval.evaluation.plan import Plan
 from vla_eval.plain_text import printable
 from vla_eval.records import EpisodeKey, EpisodeRecord
@@ -120,8 +120,9 @@ class EvaluationLines:
             return
         records = read_run(self._folder).records if n_finished else ()
         finished = {record.key: record.n_steps or 0 for record in records if record.error is None}
-        horizons = {job.key: horizon_steps(job) for job in plan.jobs}
-        self._open_steps = {key: steps for key, steps in horizons.items() if key not in finished}
+        keys = (job.key for job in plan.jobs)
+        all_steps = zip(keys, horizons(plan.jobs), strict=True)
+        self._open_steps = {key: steps for key, steps in all_steps if key not in finished}
         self._count.begin(
             n_done=n_finished,
             n_total=len(plan.jobs),

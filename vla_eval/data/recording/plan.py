@@ -11,11 +11,11 @@ from vla_eval.config.prompts import load_prompts, sentences_of
 from vla_eval.data.recording.demonstrations import ONE_BY_ONE
 from vla_eval.data.recording.encoder_check import check_encoder
 from vla_eval.data.recording.jobs import TaskPlan
+from vla_eval.envs.factory import describe_env
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, GroupKey
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
-from vla_eval.tasks.catalog import TASKS, task_spec
-from vla_eval.tasks.families import check_arguments
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 
 
@@ -34,7 +34,7 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
         UnknownNameError: a task, expert or prompt set does not exist.
         RecipeError: the expert's recipe is wrong, or the video encoder refuses its settings.
         MissingInstructionError: a task has no instruction.
-        TaskArgumentError: see `check_arguments`.
+        TaskArgumentError: see `describe_env`.
         CheckpointError: the expert's weights are not there.
     """
     check_encoder(recipe.encoder)
@@ -55,15 +55,14 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
 def _task_plan(
     recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSpec, instruction: str
 ) -> TaskPlan:
-    check_arguments(spec, recipe.env, TASKS.values())
+    env = EnvSettings(task=spec.id, kwargs=recipe.env, simulator=recipe.simulator, render=recipe.render)
+    describe_env(env)
     return TaskPlan(
         group=EpisodeGroup(
             key=GroupKey(spec.id, expert.name, 1),
             adapter=expert.value.adapter,
             args=expert.value.args,
-            env=EnvSettings(
-                task=spec.id, kwargs=recipe.env, simulator=recipe.simulator, render=recipe.render
-            ),
+            env=env,
             rollout=RolloutSettings(
                 chunking=ONE_BY_ONE,
                 stop_at_success=recipe.cut == "after_success",

@@ -1,30 +1,26 @@
-"""The arms that a task supports, a row each.
+"""The arms that a task supports, a row each. Knows nothing of simulators.
 
 The Panda is the paper's and the default. `fetch_at_table` shows what another arm needs: a ManiSkill agent
 with a tool centre point `tcp`, a camera `hand_camera`, two fingers as its last two joints and a controller
-`pd_ee_delta_pose` of seven numbers; and its row here.
+`pd_ee_delta_pose` of seven numbers (`fetch.py`); and its row here.
 """
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-import sapien
-import torch
-from gymnasium.spaces import Box
-from mani_skill.agents.controllers import PassiveController, PassiveControllerConfig
-from mani_skill.agents.registration import register_agent
-from mani_skill.agents.robots.fetch import Fetch
-from mani_skill.sensors.camera import CameraConfig
 
+from vla_eval.config.environment import WristMesh
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
-from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES
-from vla_eval.tasks.arm.robots import WRIST_MESH_ROBOTS
-from vla_eval.tasks.interface import CAMERA_FOV_RAD
+from vla_eval.features import JOINT_NAMES
 
 FINGERS = ("finger1", "finger2")
 FETCH_UID = "fetch_at_table"
-HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint with this damping does not move by itself
+WRIST_MESH_ROBOTS: dict[WristMesh, str] = {
+    "shipped": "panda_wristcam_seen",
+    "whole": "panda_wristcam",
+    "simplified": "panda_wristcam_light",
+}
+"""Value of the render option `wrist_mesh` -> robot uid of the Panda with that mesh."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,63 +62,6 @@ FETCH = Arm(
     rest_qpos=(0.0, 0.0, 0.0, 0.386, 0.0, 0.0, 0.0, -1.0106, 0.0, 1.3855, 0.0, 0.1487, 0.0, 0.05, 0.05),
     base_m=(-1.02, 0.0, -0.9),
 )
-
-
-class _Still(PassiveController):  # type: ignore[misc]  # ManiSkill is untyped
-    """Joints without a command; ManiSkill's own class uses a float64 box, for which Gymnasium warns."""
-
-    def _initialize_action_space(self) -> None:
-        none = np.empty(0, dtype=np.float32)
-        self.single_action_space = Box(none, none, dtype=np.float32)
-
-
-@dataclass
-class _StillConfig(PassiveControllerConfig):  # type: ignore[misc]  # ManiSkill is untyped
-    controller_cls = _Still
-
-
-@register_agent()
-class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
-    """ManiSkill's Fetch, standing still in front of the table: only its arm and gripper are commanded."""
-
-    uid = FETCH_UID
-
-    @property
-    def _sensor_configs(self) -> list[CameraConfig]:
-        """The wrist camera: on the hand, behind the fingers and above them, looking along them."""
-        return [
-            CameraConfig(
-                uid="hand_camera",
-                pose=sapien.Pose(p=[-0.1, 0, 0.1]),
-                width=IMAGE_SIZE_PX,
-                height=IMAGE_SIZE_PX,
-                fov=CAMERA_FOV_RAD,
-                near=0.01,
-                far=100,
-                mount=self.robot.links_map["gripper_link"],
-            )
-        ]
-
-    @property
-    def _controller_configs(self) -> dict[str, dict[str, Any]]:  # Any: ManiSkill's configurations
-        """Fetch's own, except base, torso and head, which are held by damping and take no command."""
-        still = _StillConfig(
-            self.base_joint_names + self.body_joint_names, damping=HOLDING, force_limit=HOLDING
-        )
-        return {
-            mode: {"arm": parts["arm"], "gripper": parts["gripper"], "still": still}
-            for mode, parts in super()._controller_configs.items()
-        }
-
-    def is_static(self, threshold: float = 0.2) -> torch.Tensor:
-        """Return (B,) bool: no joint of the arm is faster than the threshold.
-
-        Fetch's own rule compares signed velocities, so any negative velocity passes.
-        """
-        speeds = self.robot.get_qvel()[:, list(FETCH.arm_joints)].abs()
-        static: torch.Tensor = (speeds <= threshold).all(dim=1)
-        return static
-
 
 ARMS = {**dict.fromkeys(WRIST_MESH_ROBOTS.values(), PANDA), FETCH_UID: FETCH}
 """Value of `robot_uids` -> its row."""

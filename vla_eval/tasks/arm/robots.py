@@ -88,11 +88,3 @@ class PandaWristCamLight(PandaWristCam):  # type: ignore[misc]  # ManiSkill is u
     def urdf_path(self) -> str:
         """Path of the URDF; created when the first such arm is loaded."""
         return str(changed_urdf("light", simplified))
-
-
-WRIST_MESH_ROBOTS = {
-    "shipped": "panda_wristcam_seen",
-    "whole": "panda_wristcam",
-    "simplified": "panda_wristcam_light",
-}
-"""Value of the render option `wrist_mesh` -> robot uid."""

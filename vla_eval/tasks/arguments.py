@@ -1,0 +1,205 @@
+"""The arguments of a task: which it takes, whether they are possible, and what it then offers to a policy.
+
+No simulator is started: the task's row and the source of its class say it all.
+"""
+
+import ast
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, Literal
+
+from vla_eval.config.environment import WristMesh
+from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
+from vla_eval.errors import RecipeError, TaskArgumentError, check_names
+from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.specs import EnvSpec
+from vla_eval.strict.bounds import MAX_STEPS
+from vla_eval.strict.decoding import check_value
+from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS
+from vla_eval.tasks.interface import (
+    CONTROL_HZ,
+    IMAGE_SIZE,
+    StepRange,
+    cameras,
+    checked_image_size,
+    states,
+    step_range,
+)
+from vla_eval.tasks.source import class_constant, task_arguments
+from vla_eval.tasks.spec import TaskSpec, total_cue_steps
+
+HORIZON = "horizon_steps"
+ROBOT = "robot_uids"
+CHOICE_ARGUMENTS = ("strict_choice", "show_cue", "cue_after_steps")
+"""Arguments that only tasks with candidates have."""
+ANNOTATIONS: Mapping[str, Any] = {  # Any: type annotations
+    **{"int": int, "float": float, "bool": bool, "str": str},
+    **{"float | None": float | None, "str | None": str | None},
+    **{"StepRange": StepRange, "Sequence[float]": Sequence[float]},
+}
+"""Annotation in the source of a task -> the type; arguments with another one are checked by the class."""
+
+
+def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
+    """Check what can be wrong with a task's arguments, apart from limits that only its class knows.
+
+    Args:
+        spec: a row of the catalogue, or a family.
+        given: the user's arguments.
+        rows: the catalogue, for the message.
+
+    Raises:
+        TaskArgumentError: a required argument of a family is missing; or an argument needs candidates,
+            and this task has none; or a value is of another type or impossible; or the episode ends before
+            the choice.
+        UnknownNameError: there is no such argument, arm or control mode.
+    """
+    _check_open(spec, given, rows)
+    of_choices = [f"env.{name}" for name in CHOICE_ARGUMENTS if name in given]
+    if of_choices and spec.candidates is None:
+        raise TaskArgumentError(
+            f"{', '.join(of_choices)}: {spec.id}: there are no candidates to choose among. Use this task "
+            f"without it, in a run of its own."
+        )
+    action_spec(control_mode_of(given))
+    if IMAGE_SIZE in given:
+        checked_image_size(given[IMAGE_SIZE], task=spec.id)
+    for name, value in given.items():
+        if name.endswith("_steps"):
+            _check_steps(name, value, task=spec.id)
+    if spec.is_official:
+        return
+    _check_names_and_types(spec, given)
+    spec.n_candidates(given)
+    _check_robot(spec, given)
+    horizon_steps(spec, longest_wait_steps(spec, given), given.get(HORIZON))
+
+
+def _check_open(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
+    """Raise unless a family is given all that makes a task of it."""
+    missing = [name for name in spec.open_arguments if name not in given]
+    if not missing:
+        return
+    known = [row.id for row in rows if row.id.startswith(spec.id) and row.entry_point == spec.entry_point]
+    wanted = " ".join(f"--set env.{name}=…" for name in missing)
+    raise TaskArgumentError(
+        f"{spec.id} is a family of tasks: {', '.join(missing)} must say which one. Add {wanted}, or name "
+        f"one of {', '.join(known)}."
+    )
+
+
+def _check_names_and_types(spec: TaskSpec, given: Mapping[str, object]) -> None:
+    arguments = {argument.name: argument.annotation for argument in task_arguments(spec.entry_point)}
+    if not arguments:  # a class of another package, made in a way that cannot be read
+        return
+    check_names("argument", given, (HORIZON, *arguments), where=f"env of {spec.id}")
+    for name, value in given.items():
+        check_argument(_type_of(arguments.get(name, "int")), value, name=name, task=spec.id)
+
+
+def _type_of(annotation: str) -> Any:  # Any: a type annotation
+    if annotation.startswith("Literal["):
+        return Literal[ast.literal_eval(annotation.removeprefix("Literal[").removesuffix("]"))]
+    return ANNOTATIONS.get(annotation, Any)
+
+
+def _check_robot(spec: TaskSpec, given: Mapping[str, object]) -> None:
+    if ROBOT in given:
+        arms = (*WRIST_MESH_ROBOTS.values(), *spec.other_arms)
+        check_names("arm", [str(given[ROBOT])], arms, where=f"env.{ROBOT} of {spec.id}")
+    robot_uid(given, wrist_mesh="shipped")
+
+
+def robot_uid(given: Mapping[str, object], *, wrist_mesh: WristMesh) -> str:
+    """Return the requested arm, or the Panda with the requested mesh.
+
+    Raises:
+        TaskArgumentError: the arm has no such mesh, or does not take the requested control mode.
+    """
+    if ROBOT not in given:
+        return WRIST_MESH_ROBOTS[wrist_mesh]
+    robot, mode = str(given[ROBOT]), control_mode_of(given)
+    if wrist_mesh != "shipped" or robot in WRIST_MESH_ROBOTS.values():
+        raise TaskArgumentError(
+            f"{ROBOT}={robot!r} with render.wrist_mesh={wrist_mesh!r}: the mesh belongs to the Panda, the "
+            "default arm. Set only one of the two."
+        )
+    if robot in ARMS and mode not in ARMS[robot].control_modes:
+        raise TaskArgumentError(
+            f"{CONTROL_MODE}={mode!r} with {ROBOT}={robot!r}: this arm takes "
+            f"{', '.join(ARMS[robot].control_modes)}. Leave one of the two out."
+        )
+    return robot
+
+
+def longest_wait_steps(spec: TaskSpec, given: Mapping[str, object]) -> int:
+    """Return the most steps that cue and delay can take together with these arguments.
+
+    Raises:
+        TaskArgumentError: one of them is not a number of steps, nor a pair of them.
+    """
+    usual = {argument.name: argument.default for argument in task_arguments(spec.entry_point)}
+
+    def most(name: str, *, otherwise: int = 0) -> int:
+        value = given.get(name, spec.kwargs.get(name))
+        if value is None and name in usual:
+            value = ast.literal_eval(usual[name])
+        return step_range(name, otherwise if value is None else value)[1]
+
+    n_in_turn = most("n_shown", otherwise=1) if spec.shows_one_by_one else 1
+    cue_steps = total_cue_steps(most("cue_steps"), n_in_turn, most("gap_steps"))
+    return most("cue_after_steps") + cue_steps + most("delay_steps")
+
+
+def horizon_steps(spec: TaskSpec, longest_wait: int, wanted: object = None) -> int:
+    """Return the length of an episode: as requested, or as in the row.
+
+    Raises:
+        TaskArgumentError: too short for a step of the choice.
+    """
+    horizon = wanted if isinstance(wanted, int) else spec.default_horizon_steps(longest_wait)
+    if longest_wait >= horizon:
+        raise TaskArgumentError(
+            f"{spec.id}: cue_steps and delay_steps can be {longest_wait} together, but the episode ends "
+            f"after horizon_steps={horizon}: no step is left for the choice. Increase horizon_steps or "
+            "shorten the phases."
+        )
+    return horizon
+
+
+def offered_by(spec: TaskSpec, given: Mapping[str, object]) -> EnvSpec:
+    """Return what a task offers with these arguments, without making its environment.
+
+    Raises:
+        TaskArgumentError: the arguments are impossible.
+        UnknownNameError: there is no such control mode.
+    """
+    arm = ARMS.get(str(given.get(ROBOT)), ARMS[WRIST_MESH_ROBOTS["shipped"]])
+    prompt_dims = None if spec.is_official else class_constant(spec.entry_point, "PROMPT_DIMS")
+    wait = 0 if spec.is_official else longest_wait_steps(spec, given)
+    return EnvSpec(
+        task=spec.id,
+        cameras=cameras(checked_image_size(given.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=spec.id)),
+        states=states(arm.joints, prompt_dims if isinstance(prompt_dims, tuple) else ()),
+        action=action_spec(control_mode_of(given)),
+        horizon_steps=horizon_steps(spec, wait, given.get(HORIZON)),
+        control_hz=CONTROL_HZ,
+    )
+
+
+def check_argument(hint: Any, value: object, *, name: str, task: str) -> None:  # Any: a type annotation
+    """Raise `TaskArgumentError` unless an argument is of the type that the task declares for it."""
+    try:
+        check_value(hint, value, path=name)
+    except RecipeError as exc:
+        raise TaskArgumentError(f"{task}: {exc}") from exc
+
+
+def _check_steps(name: str, value: object, *, task: str) -> None:
+    """Raise unless this is a number of control steps, or a pair of them."""
+    least = 1 if name == HORIZON else 0
+    for steps in value if isinstance(value, list | tuple) else (value,):
+        if not isinstance(steps, int) or isinstance(steps, bool) or not least <= steps <= MAX_STEPS:
+            raise TaskArgumentError(
+                f"{task}: {name}={value!r:.80}: expected a whole number of control steps, {least} to "
+                f"{MAX_STEPS}, or, where a duration may be drawn, a pair of them."
+            )

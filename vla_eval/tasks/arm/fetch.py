@@ -1,0 +1,75 @@
+"""ManiSkill's Fetch at the table; importing it registers the arm."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import sapien
+import torch
+from gymnasium.spaces import Box
+from mani_skill.agents.controllers import PassiveController, PassiveControllerConfig
+from mani_skill.agents.registration import register_agent
+from mani_skill.agents.robots.fetch import Fetch
+from mani_skill.sensors.camera import CameraConfig
+
+from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.tasks.arm.arms import FETCH, FETCH_UID
+from vla_eval.tasks.interface import CAMERA_FOV_RAD
+
+HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint with this damping does not move by itself
+
+
+class _Still(PassiveController):  # type: ignore[misc]  # ManiSkill is untyped
+    """Joints without a command; ManiSkill's own class uses a float64 box, for which Gymnasium warns."""
+
+    def _initialize_action_space(self) -> None:
+        none = np.empty(0, dtype=np.float32)
+        self.single_action_space = Box(none, none, dtype=np.float32)
+
+
+@dataclass
+class _StillConfig(PassiveControllerConfig):  # type: ignore[misc]  # ManiSkill is untyped
+    controller_cls = _Still
+
+
+@register_agent()
+class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
+    """ManiSkill's Fetch, standing still in front of the table: only its arm and gripper are commanded."""
+
+    uid = FETCH_UID
+
+    @property
+    def _sensor_configs(self) -> list[CameraConfig]:
+        """The wrist camera: on the hand, behind the fingers and above them, looking along them."""
+        return [
+            CameraConfig(
+                uid="hand_camera",
+                pose=sapien.Pose(p=[-0.1, 0, 0.1]),
+                width=IMAGE_SIZE_PX,
+                height=IMAGE_SIZE_PX,
+                fov=CAMERA_FOV_RAD,
+                near=0.01,
+                far=100,
+                mount=self.robot.links_map["gripper_link"],
+            )
+        ]
+
+    @property
+    def _controller_configs(self) -> dict[str, dict[str, Any]]:  # Any: ManiSkill's configurations
+        """Fetch's own, except base, torso and head, which are held by damping and take no command."""
+        still = _StillConfig(
+            self.base_joint_names + self.body_joint_names, damping=HOLDING, force_limit=HOLDING
+        )
+        return {
+            mode: {"arm": parts["arm"], "gripper": parts["gripper"], "still": still}
+            for mode, parts in super()._controller_configs.items()
+        }
+
+    def is_static(self, threshold: float = 0.2) -> torch.Tensor:
+        """Return (B,) bool: no joint of the arm is faster than the threshold.
+
+        Fetch's own rule compares signed velocities, so any negative velocity passes.
+        """
+        speeds = self.robot.get_qvel()[:, list(FETCH.arm_joints)].abs()
+        static: torch.Tensor = (speeds <= threshold).all(dim=1)
+        return static
