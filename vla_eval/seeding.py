@@ -4,10 +4,11 @@ One generator per (episode seed, purpose): what one purpose draws cannot shift w
 and neither batch size, device, order of episodes nor global random state plays a part.
 """
 
+import contextlib
 import hashlib
 import random
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum, unique
 
@@ -79,3 +80,18 @@ def seed_global_generators(*purpose: str | int) -> None:
     torch = sys.modules.get("torch")  # not imported for this: that takes seconds
     if torch is not None:
         torch.manual_seed(int.from_bytes(digest[:8], "little") >> 1)
+
+
+@contextlib.contextmanager
+def global_generators_kept() -> Iterator[None]:
+    """Give these generators back as they were: in a process that is the user's own."""
+    state, numpy_state = random.getstate(), np.random.get_state()  # nothing is drawn
+    torch = sys.modules.get("torch")
+    torch_state = torch.get_rng_state() if torch is not None else None
+    try:
+        yield
+    finally:
+        random.setstate(state)
+        np.random.set_state(numpy_state)
+        if torch is not None:
+            torch.set_rng_state(torch_state)

@@ -71,6 +71,7 @@ def _check_server(args: argparse.Namespace) -> list[str]:
 
 
 def _check_policy(args: argparse.Namespace) -> list[str]:
+    from vla_eval.policies.entries import load_policy_entry
     from vla_eval.testing.check_recipe import check_recipe
 
     if args.api_key_env is not None or args.timeout_seconds is not None:
@@ -78,4 +79,6 @@ def _check_policy(args: argparse.Namespace) -> list[str]:
             "--api-key-env and --timeout-seconds are for the address of a server, ws://HOST:PORT."
         )
     say = functools.partial(print, file=sys.stderr, flush=True)
-    return check_recipe(args.policy, task=args.task or DEFAULT_TASK, report=_print_met, say=say)
+    return check_recipe(
+        load_policy_entry(args.policy), task=args.task or DEFAULT_TASK, report=_print_met, say=say
+    )

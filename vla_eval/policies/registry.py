@@ -112,7 +112,7 @@ def policy_factory(adapter: str) -> PolicyFactory:
                 f"policy adapter '{adapter}': {module_name} has no '{attribute}'.{did_you_mean(part, known)}"
             )
         found = getattr(found, part)
-    if not _takes_a_context(found):
+    if not takes_a_context(found):
         raise UnknownNameError(
             f"policy adapter '{adapter}': {found!r:.60} is not a function that makes a policy, nor a class "
             f"of policies: expected `make(context, **args)`."
@@ -161,7 +161,7 @@ def _target(adapter: str) -> tuple[str, str]:
     return module_name, attribute
 
 
-def _takes_a_context(found: Any) -> bool:  # Any: whatever the module holds
+def takes_a_context(found: Any) -> bool:  # Any: whatever the module holds
     """Whether this is a function or a class that can be given a context as its first argument."""
     if not (inspect.isroutine(found) or inspect.isclass(found) or isinstance(found, functools.partial)):
         return False

@@ -13,9 +13,10 @@ from vla_eval.core import Observation
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
 from vla_eval.evaluation.plan import make_plan
-from vla_eval.evaluation.resolve import resolve
+from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.evaluation.worker import EnvFacts, make_policy
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceWatch
+from vla_eval.policies.entries import PolicyEntry
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_policy import check_policy
 
@@ -23,12 +24,16 @@ N_SLOTS = 2  # as many episodes as the check runs side by side
 
 
 def check_recipe(
-    policy: str, *, task: str, report: Callable[[str], None], say: Callable[[str], None] = lambda _line: None
+    policy: PolicyEntry,
+    *,
+    task: str,
+    report: Callable[[str], None],
+    say: Callable[[str], None] = lambda _line: None,
 ) -> list[str]:
-    """Check a policy by its name, its recipe's file or its checkpoint's folder; return what is met.
+    """Check the policy of an evaluation; return what is met.
 
     Args:
-        policy: what `eval --policy` takes.
+        policy: as `load_policy_entry` returns it.
         task: the task whose cameras, states and actions it is given.
         report: called with each requirement that is met, as soon as that is known.
         say: gets what differs from the policy's training and is not a requirement, line by line.
@@ -36,12 +41,12 @@ def check_recipe(
     config = EvalConfig(
         name="check",
         tasks=(task,),
-        policies=(policy,),
+        policies=policy.texts[:1],
         episodes=1,
         slots_per_worker=N_SLOTS,
         simulator="fake",
     )
-    plan = make_plan(resolve(config))
+    plan = make_plan(ResolvedEvaluation.of(config, [policy]))
     for line in (*(f"warning: {one}" for one in plan.warnings), *(f"note: {one}" for one in plan.notes)):
         say(line)
     group = plan.jobs[0].group

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -64,7 +65,8 @@ def stop_on_signals(answer: str = "") -> Iterator[StopRequest]:
             os.write(STDERR, f"\n{answer}\n".encode())  # `print` may be what was interrupted
 
     previous: dict[int, Any] = {}  # Any: what `signal.signal` takes and gives
-    for name in STOP_SIGNALS:
+    is_main = threading.current_thread() is threading.main_thread()  # only there may handlers be set
+    for name in STOP_SIGNALS if is_main else ():
         number = getattr(signal, name)
         # `nohup` has SIGHUP ignored: leave it so.
         if signal.getsignal(number) is not signal.SIG_IGN:

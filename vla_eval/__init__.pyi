@@ -1,0 +1,8 @@
+from vla_eval.api.checking import check_policy as check_policy
+from vla_eval.api.evaluating import evaluate as evaluate
+from vla_eval.api.listing import list_policies as list_policies
+from vla_eval.api.listing import list_tasks as list_tasks
+from vla_eval.api.run import Run as Run
+from vla_eval.api.run import load_run as load_run
+
+__version__: str

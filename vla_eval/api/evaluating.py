@@ -1,0 +1,124 @@
+"""`vla_eval.evaluate`: `mikasa-vla eval` from Python, also for a policy that is a Python object."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any  # policies are whatever the user gives; plain data
+
+from vla_eval.api.run import Run, load_run
+from vla_eval.cli.terminal.progress import evaluate_with_progress, stop_on_signals
+from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.files import digest_of, load_recipe, to_data
+from vla_eval.config.protocol import fill_from_protocol
+from vla_eval.errors import RecipeError
+from vla_eval.evaluation.resolve import FINGERPRINT_DIGITS, RUNS_FOLDER, ResolvedEvaluation
+from vla_eval.policies.entries import PolicyEntry, load_policy_entry
+from vla_eval.policies.given import given_entry
+from vla_eval.strict.decoding import decode
+from vla_eval.workers.in_process import IN_PROCESS
+from vla_eval.workers.local import LOCAL
+
+
+def evaluate(
+    config: EvalConfig | str | Path | None = None,
+    *,
+    policy: Any = None,
+    tasks: str | Sequence[str] | None = None,
+    n_action_steps: int | Sequence[int] | None = None,
+    out: str | Path | None = None,
+    in_process: bool = False,
+    allow_environment_change: bool = False,
+    **fields: Any,
+) -> Run:
+    """Run or resume an evaluation, as `mikasa-vla eval` does, and return its results.
+
+    The same call again, in the same folder, runs only the episodes that have no result yet. Policies run in
+    worker processes, on copies of what is given: what an instance remembers there is not seen here. Scripts
+    need no `if __name__ == "__main__"`.
+
+    Args:
+        config: a configuration, its file, or the name of one in `configs/`; None: the arguments say it all.
+        policy: one policy or a list of them: a name as for `--policy`, an instance, a class, or a function
+            that makes one from a `PolicyContext` or from nothing. A mapping gives them names for the table.
+        tasks: one task id or several.
+        n_action_steps: one number or several: actions executed per inference (K).
+        out: the run folder; None: one in `runs/`, for each configuration and each version of the policies.
+        in_process: run the episodes one after another in this process: for a debugger, or to see what a
+            policy prints. No time limit then applies.
+        allow_environment_change: resume although package versions or the machine have changed.
+        **fields: further fields of `EvalConfig`: `episodes`, `seed_start`, `runs`, `workers`, `env`, …
+
+    Raises:
+        VlaEvalError: a mistake that every episode would repeat; see `vla_eval.evaluation.evaluate`.
+        KeyboardInterrupt: Ctrl-C; what has finished is kept, and the same call resumes.
+    """
+    entries = _entries(policy)
+    given = {"tasks": _listed(tasks), "n_action_steps": _listed(n_action_steps), **fields}
+    if entries:
+        given["policies"] = [entry if isinstance(entry, str) else entry.name for entry in entries]
+    read = _config(config, {name: value for name, value in given.items() if value is not None})
+    policies = [
+        one if isinstance(one, PolicyEntry) else load_policy_entry(one) for one in entries or read.policies
+    ]
+    backend = IN_PROCESS if in_process else LOCAL
+    resolved = ResolvedEvaluation.of(read, policies, backend=backend, out=Path(out) if out else None)
+    objects = {one.name: one.recipes[0].sha256 for one in entries if isinstance(one, PolicyEntry)}
+    if objects and out is None:  # another version of the class is another run
+        digest = digest_of([resolved.fingerprint, objects])[:FINGERPRINT_DIGITS]
+        folder = RUNS_FOLDER / f"{read.name}-{digest}"
+        resolved = ResolvedEvaluation.of(read, policies, backend=backend, out=folder)
+    with stop_on_signals() as stop:
+        summary = evaluate_with_progress(
+            resolved,
+            command="vla_eval.evaluate(…)",
+            stop=stop,
+            allow_environment_change=allow_environment_change,
+            json_progress=None,
+        )
+    if summary.was_stopped:
+        n_done = summary.n_episodes - summary.n_open
+        raise KeyboardInterrupt(
+            f"stopped with {n_done} of {summary.n_episodes} episodes in {summary.out}; the same call resumes"
+        )
+    return load_run(summary.out)
+
+
+def _entries(policy: Any) -> list[str | PolicyEntry]:
+    """Return names as they are, objects as entries."""
+    if policy is None:
+        return []
+    if isinstance(policy, Mapping):
+        return [_entry(found, str(name)) for name, found in policy.items()]
+    several = policy if isinstance(policy, (list, tuple)) else [policy]
+    return [_entry(one, None) for one in several]
+
+
+def _entry(found: Any, name: str | None) -> str | PolicyEntry:
+    if isinstance(found, (str, Path)):
+        return str(found) if name is None else f"{name}={found}"
+    return given_entry(found, name=name)
+
+
+def _listed(value: Any) -> list[Any] | None:
+    if value is None:
+        return None
+    return list(value) if isinstance(value, (list, tuple, range)) else [value]
+
+
+def _config(config: EvalConfig | str | Path | None, given: Mapping[str, Any]) -> EvalConfig:
+    """Return the configuration with what is given on top."""
+
+    def edit(data: dict[str, Any]) -> None:
+        data.update(given)
+        fill_from_protocol(data)
+
+    if isinstance(config, (str, Path)):
+        return load_recipe("configs", str(config), EvalConfig, edit=edit).value
+    data = {"name": str(given.get("protocol") or "eval")} if config is None else to_data(config)
+    edit(data)
+    for field, argument in (("tasks", "tasks"), ("policies", "policy")):
+        if field not in data:
+            raise RecipeError(
+                f"evaluate: `{argument}` is missing. Expected a configuration, or at least tasks and policy: "
+                f'vla_eval.evaluate(policy="oracle", tasks="RememberColor3-v0")'
+            )
+    return decode(EvalConfig, data, where="evaluate")
