@@ -18,11 +18,11 @@ from vla_eval.results.sweep_format import render_sweep
 PDFLATEX = shutil.which("pdflatex")
 TASKS = (COLOR, INTERCEPT, "RememberShapeAndColor5x3-v0", "ShellGameTouch-v0", "SeqOfColors7-v0", "Rotate-v0")
 OUTCOMES = {
-    "memory_color3": "+" * 10,
-    "memoryless_color3": "+++-------",
-    "oracle": "+" * 10,
-    "cue_blind": "++--------",
-    "random": "-" * 10,
+    "memory_color3": "+" * 20,
+    "memoryless_color3": "+" * 6 + "-" * 14,
+    "oracle": "+" * 20,
+    "cue_blind": "+" * 4 + "-" * 16,
+    "random": "-" * 20,
 }
 
 
@@ -52,22 +52,49 @@ def test_tasks_are_columns_policies_are_rows_and_the_best_policy_is_bold() -> No
     assert by_name[r"memory\_color3"] == [r"\textbf{1.00}"] * 2
     assert by_name[r"memoryless\_color3"] == ["0.30"] * 2
     assert by_name["oracle"] == ["1.00"] * 2  # a control is never the best policy
-    # Wilson, 3 of 10: (0.3 + 0.19207) / 1.38415 ± 0.24806.
-    assert [r"{\scriptsize [0.11, 0.60]}"] * 2 in [row[1:] for row in rows]
+    # Wilson, 6 of 20: (0.3 + 0.09604) / 1.19207 ± 0.18675.
+    assert [r"{\scriptsize [0.15, 0.52]}"] * 2 in [row[1:] for row in rows]
+
+
+@pytest.mark.parametrize(
+    ("outcomes", "why"),
+    [
+        (("-" * 20, "-" * 20), "a tie at the floor"),
+        (("+" * 20, "+" * 20), "a tie at the ceiling"),
+        (("+" * 4 + "-" * 16, "-" * 20), "at chance"),
+        (("+" * 3 + "-" * 17, "-" * 20), "below chance"),
+        (("+" * 20, "+" * 17 + "---"), "3 episodes are no difference: p = 0.25"),
+        (("+" * 20,), "nothing to be better than"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_nothing_is_bold_that_is_not_shown_to_be_the_best(outcomes: tuple[str, ...], why: str) -> None:
+    names = ("first", "second")[: len(outcomes)]
+    groups = [episodes(name, found) for name, found in zip(names, outcomes, strict=True)]
+    table = build_table([stored(*groups, episodes("cue_blind", OUTCOMES["cue_blind"]))])
+    assert "textbf" not in preset(table), why
+
+
+def test_without_a_measured_chance_the_interval_has_to_be_above_it() -> None:
+    def shown(best: str) -> str:
+        return preset(build_table([stored(episodes("a", best), episodes("b", "-" * 20))]))
+
+    assert r"\textbf{0.75}" in shown("+" * 15 + "-" * 5)  # Wilson's lower end 0.53 is above 1/3
+    assert "textbf" not in shown("+" * 9 + "-" * 11)  # 0.26 is not
 
 
 def test_a_caption_speaks_of_what_is_in_the_table() -> None:
     whole = preset(a_table(COLOR))
     for part in (
-        "10 episodes per cell",
+        "20 episodes per cell",
         "$K = 1$",
-        "best policy",
+        "Bold: the best policy",
         r"cue\_blind: the same arm without",
         "tab:demo",
     ):
         assert part in whole
     alone = preset(a_table(COLOR, policies=("memory_color3",)))
-    for part in ("bold", "Controls", "$\\pm$", "error"):
+    for part in ("Bold", "Controls", "$\\pm$", "error"):
         assert part not in alone
     assert r"chance, 1/N & 0.33 \\" in alone  # not measured, so it is said where it comes from
 
@@ -84,7 +111,7 @@ def test_settings_have_letters_which_the_caption_explains() -> None:
         stored(episodes("p", "--"), path="runs/b", env={"delay_steps": 9}),
     ]
     text = preset(build_table(runs))
-    assert r"p (a) & \textbf{0.50}" in text and "p (b) & 0.00" in text
+    assert r"p (a) & 0.50" in text and "p (b) & 0.00" in text
     assert r"Settings: (a) env.delay\_steps=5; (b) env.delay\_steps=9." in text
 
 

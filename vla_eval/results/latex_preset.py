@@ -1,13 +1,14 @@
 """Write a table as a paper has it: LaTeX, tasks as columns, policies as rows, the best policy in bold."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
-from vla_eval.results.comparison import Success
+from vla_eval.results.comparison import Success, compare
+from vla_eval.results.estimates import LEVEL
 from vla_eval.results.grouping import RowKey
 from vla_eval.results.latex import latex_first, latex_text
 from vla_eval.results.own_statistics import EPISODES, SUCCESS
-from vla_eval.results.relative_statistics import BY_ARITHMETIC, CHANCE
+from vla_eval.results.relative_statistics import BY_ARITHMETIC, CHANCE, against_chance
 from vla_eval.results.success_table import Row, Table
 
 CONTROLS = {
@@ -38,6 +39,7 @@ def paper_preset(table: Table) -> str:
     labels = dict.fromkeys(row.key.of_all_tasks for row in table.rows)
     names = {label: _name(label, list(labels), table.variants) for label in labels}
     cells = {(row.key.of_all_tasks, row.task): row for row in table.rows}
+    best = _best(table.rows)
     width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
     n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
     blocks = [tasks[i : i + n_side_by_side] for i in range(0, len(tasks), n_side_by_side)]
@@ -53,12 +55,15 @@ def paper_preset(table: Table) -> str:
         f"\\setlength{{\\tabcolsep}}{{{COLUMN_SPACE_PT / 2:g}pt}}",
     ]
     for number, block in enumerate(blocks):
-        lines += [*(["", "\\medskip"] if number else []), *_tabular(block, names, cells)]
+        lines += [*(["", "\\medskip"] if number else []), *_tabular(block, names, cells, best)]
     return "\n".join([*lines, "\\end{table}"])
 
 
 def _tabular(
-    tasks: Sequence[str], names: dict[RowKey, str], cells: dict[tuple[RowKey, str], Row]
+    tasks: Sequence[str],
+    names: dict[RowKey, str],
+    cells: dict[tuple[RowKey, str], Row],
+    best: Collection[RowKey],
 ) -> list[str]:
     lines = [f"\\begin{{tabular}}{{@{{}}l{'c' * len(tasks)}@{{}}}}", "\\toprule"]
     titles = [_title(task) for task in tasks]
@@ -69,14 +74,13 @@ def _tabular(
         lines.append(" & ".join(["", *map(latex_text, parts)]) + r" \\")
     learned = [label for label in names if label.policy not in CONTROLS]
     controls = [label for label in names if label.policy in CONTROLS]
-    best = {task: _best([cells.get((label, task)) for label in learned]) for task in tasks}
     for group in (learned, controls):
         lines += ["\\midrule"] if group else []
         for label in group:
             found = [cells.get((label, task)) for task in tasks]
             if not any(found):  # it is in another block
                 continue
-            lines += _row(names[label], found, [row is not None and row in best[row.task] for row in found])
+            lines += _row(names[label], found, [row is not None and row.key in best for row in found])
     by_luck = [_by_luck(task, cells) for task in tasks]
     if any(by_luck):
         lines += [] if controls else ["\\midrule"]
@@ -104,11 +108,31 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
     ]
 
 
-def _best(rows: Sequence[Row | None]) -> list[Row]:
-    """Return the rows with the highest rate; none if there is nothing to be better than."""
-    known = [(row, rate) for row in rows if row and (rate := row[SUCCESS].success_once) is not None]
-    highest = max((rate for _, rate in known), default=0.0)
-    return [row for row, rate in known if rate == highest] if len(known) > 1 else []
+def _best(rows: Sequence[Row]) -> set[RowKey]:
+    """Return which rows are in bold: of each task the best policy, where it is shown to be the best.
+
+    That is, above chance, and unlike the next policy on the same episodes (exact paired test, the p values
+    of all tasks corrected together).
+    """
+    pairs = {}
+    for task in dict.fromkeys(row.task for row in rows):
+        learned = [row for row in rows if row.task == task and row.policy not in CONTROLS]
+        rates = ((row[SUCCESS].success_once, row) for row in learned)
+        known = [(rate, row) for rate, row in rates if rate is not None]
+        ranked = sorted(known, key=lambda one: -one[0])
+        if len(ranked) > 1 and ranked[0][0] > ranked[1][0] and _is_above_chance(ranked[0][1]):
+            pairs[task] = (ranked[0][1].episodes, ranked[1][1].episodes)
+    found = compare(pairs)
+    return {pairs[task][0].key for task, one in found.items() if one.corrected_p < LEVEL}
+
+
+def _is_above_chance(row: Row) -> bool:
+    """Whether it is shown to be above chance; above an unknown chance, nothing can be shown."""
+    compared, chance = against_chance(row), row[CHANCE]
+    if compared is not None:
+        return compared.corrected_p < LEVEL and compared.test.difference > 0
+    low = row[SUCCESS].ci_low
+    return chance is not None and low is not None and low > chance.rate
 
 
 def _by_luck(task: str, cells: dict[tuple[RowKey, str], Row]) -> str | None:
@@ -160,7 +184,10 @@ def _caption(table: Table) -> str:
         sentences.append("$\\pm$: standard error over the runs.")
     learned = {row.key.of_all_tasks for row in rows if row.policy not in CONTROLS}
     if len(learned) > 1:
-        sentences.append("The best policy of each task is in bold.")
+        sentences.append(
+            "Bold: the best policy of a task, where it is above chance and differs from the next one on the "
+            f"same episodes (exact paired test, $p < {LEVEL:g}$ after Holm's correction)."
+        )
     controls = dict.fromkeys(row.policy for row in rows if row.policy in CONTROLS)
     if controls:
         said = "; ".join(f"{latex_text(name)}: {CONTROLS[name]}" for name in controls)

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from vla_eval.errors import some_of
-from vla_eval.results.comparison import TOUR_POLICY, Chance, Comparison
+from vla_eval.results.comparison import CHANCE_POLICY, TOUR_POLICY, Chance, Comparison
 from vla_eval.results.estimates import chance_corrected
 from vla_eval.results.own_statistics import EPISODES, SUCCESS, count, rate
 from vla_eval.results.printed_table import UNDEFINED, Column
@@ -180,3 +180,8 @@ CORRECTED: Statistic[float | None] = Statistic(
     cells=lambda value: {"chance_corrected": value},
     columns=(Column("corrected", lambda row: rate(row[CORRECTED]), name="corrected", rank=5),),
 )
+
+
+def against_chance(row: Row) -> Comparison | None:
+    """Return the comparison with the policy without the cue on the same episodes, where there is one."""
+    return next((one for one in row[PAIRED] if one and one.baseline.policy == CHANCE_POLICY), None)

@@ -4,11 +4,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple
 
-from vla_eval.results.comparison import CHANCE_POLICY, Comparison
+from vla_eval.results.comparison import CHANCE_POLICY
 from vla_eval.results.estimates import LEVEL
 from vla_eval.results.latex_preset import CONTROLS
 from vla_eval.results.own_statistics import CHOICES, EPISODES, SUCCESS
-from vla_eval.results.relative_statistics import CHANCE, PAIRED, SMALLEST_SHOWN_P
+from vla_eval.results.relative_statistics import CHANCE, PAIRED, SMALLEST_SHOWN_P, against_chance
 from vla_eval.results.success_table import Row, Table
 
 Finding = Literal["no result", "chance unknown", "beats", "not shown", "worse"]
@@ -64,14 +64,10 @@ def _rank(row: Row) -> tuple[float, float]:
     return difference, success
 
 
-def _against_chance(row: Row) -> Comparison | None:
-    return next((one for one in row[PAIRED] if one and one.baseline.policy == CHANCE_POLICY), None)
-
-
 def _finding(row: Row) -> Finding:
     if row[SUCCESS].success_once is None:
         return "no result"
-    compared = _against_chance(row)
+    compared = against_chance(row)
     if compared is None:
         return "chance unknown"
     if compared.corrected_p >= LEVEL:
@@ -110,7 +106,7 @@ def _unknown_chance(rows: Sequence[Row]) -> str:
 
 
 def _said(row: Row) -> str:
-    compared = _against_chance(row)
+    compared = against_chance(row)
     assert compared is not None  # as in every row whose chance was measured
     test = compared.test
     difference = f"{test.difference:+.2f} [{test.interval.low:+.2f}, {test.interval.high:+.2f}]"
