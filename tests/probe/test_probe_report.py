@@ -1,5 +1,6 @@
 """`report` and its page have a section on the probes among their run folders."""
 
+import dataclasses
 import re
 from pathlib import Path
 
@@ -8,9 +9,13 @@ import pytest
 from tests.probe.test_probe import TASK_CONFIG
 from tests.probe.test_quantities import record
 from vla_eval.cli.main import main
+from vla_eval.config.evaluation import ProbedWorld
+from vla_eval.errors import VlaEvalError
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.page.build import build_page
 from vla_eval.probe.choice_pairs import choice_pairs
 from vla_eval.probe.find_worlds import find_probes
+from vla_eval.probe.grid import GridSettings, plan_grid
 from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.page.sections import probe_sections
 from vla_eval.probe.report_text import probe_texts
@@ -47,7 +52,7 @@ PROBE_RUNS = [
 """Follows the cue in both worlds of two pairs of three; after 80 steps in one episode of three."""
 
 
-def test_worlds_are_found_by_the_names_of_their_folders() -> None:
+def test_worlds_of_older_versions_are_found_by_their_names() -> None:
     runs = [
         world("swap_1", 1, target=1, swap_cue=1),
         world("delay_swap_80", 1, target=1, delay_steps=80),
@@ -73,6 +78,58 @@ def test_worlds_are_found_by_the_names_of_their_folders() -> None:
     assert (grid.world.axis, grid.world.level, grid.world.first_inference_step) == ("delay", 5, 3)
     assert grid.world.phases.response_step == 10
     assert find_probes([stored("demo", record(1)), world("none", 0)]) == []
+
+
+def stating(name: str, world: object) -> StoredRun:
+    run = stored(name, record(1))
+    description = dataclasses.replace(run.description, options={"world": world})  # type: ignore[dict-item]
+    return dataclasses.replace(run, description=description)
+
+
+def test_worlds_are_found_by_what_their_files_state_whatever_they_are_called() -> None:
+    runs = [
+        stating("one", {"change": "none", "level": None, "first_inference_step": None}),
+        stating("two", {"change": "mask", "level": "cue", "first_inference_step": None}),
+        stating("three", {"change": "cue", "level": 7, "first_inference_step": 2}),
+        stating(f"{TASK}_delay_80", {"change": "swap", "level": 2, "first_inference_step": None}),
+        stating(f"{TASK}_swap_1", None),  # an evaluation that happens to be called so
+    ]
+    (found,) = find_probes(runs)
+    assert [(one.world.intervention, one.world.level) for one in found.worlds] == [
+        ("none", None),
+        ("swap", 2),
+        ("mask", "cue"),
+    ]
+    (grid,) = found.grid
+    assert grid.world.place == (TASK, "cue", 7, 2)
+
+
+@pytest.mark.parametrize(
+    ("world", "message"),
+    [
+        ({"change": "swaps"}, "Did you mean 'swap'"),
+        ({"change": "swap", "by": 1}, r"options\.world\.by'"),
+        ({"change": "delay", "level": "x", "first_inference_step": 1}, "a number, in a grid"),
+        ("swap_1", "found 'swap_1'"),
+    ],
+)
+def test_a_world_that_cannot_be_is_refused(world: object, message: str) -> None:
+    with pytest.raises(VlaEvalError, match=message):
+        find_probes([stating("one", world)])
+
+
+def test_probes_and_grids_state_their_worlds_and_no_fingerprint_depends_on_it() -> None:
+    worlds = [*plan_probe(TASK_CONFIG, ProbeSettings(probes=("swap",))).worlds]
+    worlds += plan_grid(TASK_CONFIG, GridSettings(delays=(5,), first_inferences=(0,))).worlds
+    stated = [one.config.world for one in worlds]
+    assert stated == [
+        ProbedWorld(change="none"),
+        ProbedWorld(change="swap", level=1),
+        ProbedWorld(change="delay", level=5, first_inference_step=0),
+    ]
+    for one in worlds:
+        without = dataclasses.replace(one.config, world=None)
+        assert resolve(one.config).fingerprint == resolve(without).fingerprint
 
 
 def test_a_copy_of_a_world_is_not_counted_and_not_hidden() -> None:

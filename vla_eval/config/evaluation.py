@@ -38,6 +38,25 @@ class TimeoutConfig:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ProbedWorld:
+    """Which world of a probe an evaluation is; `mikasa-vla probe` states it in `run.json`.
+
+    Attributes:
+        change: what is changed, `none` for nothing; in a grid, the phase whose length is changed.
+        level: by how much: a number, or a name; None where there is nothing to count.
+        first_inference_step: in a grid, the step of the first inference; None: not of a grid.
+    """
+
+    change: str
+    level: int | str | None = None
+    first_inference_step: int | None = None
+
+    def __post_init__(self) -> None:
+        in_grid = self.first_inference_step is not None
+        require(not in_grid or isinstance(self.level, int), "level", self.level, "a number, in a grid")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class EvalConfig:
     """`configs/*.yaml`: one evaluation. `docs/evaluation.md` has the table of all keys."""
 
@@ -68,6 +87,7 @@ class EvalConfig:
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     max_consecutive_errors: Episodes = 10
     capture: CaptureConfig = field(default_factory=CaptureConfig, metadata=formerly("recording"))
+    world: ProbedWorld | None = None
 
     def __post_init__(self) -> None:
         check_run_name(self.name)
@@ -83,5 +103,6 @@ class EvalConfig:
 
 OPTION_FIELDS = (
     *("name", "description", "protocol", "workers", "timeouts", "max_consecutive_errors", "capture"),
+    "world",
 )
 """Fields of `EvalConfig` that move no result: they may differ when a run is resumed."""

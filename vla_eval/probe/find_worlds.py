@@ -1,20 +1,24 @@
-"""Find the worlds of probes and grids among run folders, by the names in their `run.json`."""
+"""Find the worlds of probes and grids among run folders, by what their `run.json` states."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import EvalConfig, ProbedWorld
+from vla_eval.errors import check_names
 from vla_eval.probe.choice_pairs import ChoicePairs, choice_pairs
-from vla_eval.probe.grid import GridWorld, named_grid_world
+from vla_eval.probe.grid import AXES, GridWorld, named_grid_world
 from vla_eval.probe.grid_table import GridTable, grid_table
 from vla_eval.probe.interventions import INTERVENTIONS, named_world
+from vla_eval.probe.phases import fixed_phases
 from vla_eval.probe.table import ProbeTable, policy_order, probe_table
 from vla_eval.probe.world_records import by_policy
 from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.results.grouping import config_names
+from vla_eval.storage.run_file import RUN_FILE
 from vla_eval.storage.run_folder import StoredRun
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.strict.decoding import check_value
+from vla_eval.tasks.catalog import TASKS, task_spec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,10 +80,12 @@ def _probe(folder: Path, runs: Sequence[StoredRun]) -> FoundProbe:
     for run in runs:
         first.setdefault(run.description.name, run)
     doubles = [run for run in runs if run is not first[run.description.name]]
-    grid = _found(first.values(), named_grid_world)
+    found = [(world, run) for run in first.values() if (world := _world(run)) is not None]
+    worlds = [Found(world=world, run=run) for world, run in found if isinstance(world, World)]
+    grid = [Found(world=world, run=run) for world, run in found if isinstance(world, GridWorld)]
     return FoundProbe(
         folder=folder,
-        worlds=_with_drawn(_found(first.values(), named_world)),
+        worlds=_with_drawn(worlds),
         grid=tuple(sorted(grid, key=lambda one: one.world.place)),
         doubles=tuple(
             f"{run.path}: it has the name of {first[run.description.name].path}, and is not in this section."
@@ -88,23 +94,48 @@ def _probe(folder: Path, runs: Sequence[StoredRun]) -> FoundProbe:
     )
 
 
-def _found[W](runs: Iterable[StoredRun], named: Callable[[str, str, EvalConfig], W | None]) -> list[Found[W]]:
-    """Return the runs whose names, after that of their only task, are those of worlds."""
-    found = []
-    for run in runs:
-        tasks, name = config_names(run, "tasks"), run.description.name
-        if len(tasks) != 1 or tasks[0] not in TASKS or not name.startswith(f"{tasks[0]}_"):
-            continue
-        env = run.description.config.get("env")
-        config = EvalConfig(  # the part that the table of a probe needs
-            name=name,
-            tasks=tasks,
-            policies=config_names(run, "policies"),
-            env=dict(env) if isinstance(env, dict) else {},
-        )
-        world = named(tasks[0], name.removeprefix(f"{tasks[0]}_"), config)
-        found += [] if world is None else [Found(world=world, run=run)]
-    return found
+def _world(run: StoredRun) -> World | GridWorld | None:
+    """Return the world that a run is, as its `run.json` states; None if it is not one of a probe."""
+    tasks = config_names(run, "tasks")
+    if len(tasks) != 1 or tasks[0] not in TASKS:
+        return None
+    stated = _stated(run, tasks[0])
+    if stated is None:
+        return None
+    env = run.description.config.get("env")
+    config = EvalConfig(  # the part that the table of a probe needs
+        name=run.description.name,
+        tasks=tasks,
+        policies=config_names(run, "policies"),
+        env=dict(env) if isinstance(env, dict) else {},
+    )
+    where = f"{run.path / RUN_FILE}, options.world.change"
+    if stated.first_inference_step is None:
+        check_names("intervention", [stated.change], (AS_DRAWN, *INTERVENTIONS), where=where)
+        return World(task=tasks[0], intervention=stated.change, level=stated.level, config=config)
+    check_names("axis", [stated.change], AXES, where=where)
+    return GridWorld(
+        task=tasks[0],
+        axis="delay" if stated.change == "delay" else "cue",
+        level=int(stated.level or 0),
+        first_inference_step=stated.first_inference_step,
+        phases=fixed_phases(task_spec(tasks[0]), config.env),
+        config=config,
+    )
+
+
+def _stated(run: StoredRun, task: str) -> ProbedWorld | None:
+    name, options = run.description.name, run.description.options
+    if "world" not in options:
+        # Folders of versions that did not write the field: only their name says it, after that of the task.
+        if not name.startswith(f"{task}_"):
+            return None
+        rest = name.removeprefix(f"{task}_")
+        return named_world(rest) or named_grid_world(rest)
+    stated: ProbedWorld | None = check_value(
+        ProbedWorld | None, options["world"], path=f"{run.path / RUN_FILE}: options.world"
+    )
+    return stated
 
 
 def _with_drawn(found: Sequence[Found[World]]) -> tuple[Found[World], ...]:

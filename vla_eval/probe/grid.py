@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.errors import RecipeError
 from vla_eval.probe.interventions import refuse_own_arguments
 from vla_eval.probe.phases import Phases, divides, fixed_phases
@@ -66,18 +66,13 @@ class GridWorld:
         return self.task, self.axis, self.level, self.first_inference_step
 
 
-def named_grid_world(task: str, name: str, config: EvalConfig) -> GridWorld | None:
+def named_grid_world(name: str) -> ProbedWorld | None:
     """Return the world that is called so, after its task; None if it is not the name of one."""
     named = _NAME.fullmatch(name)
     if named is None:
         return None
-    return GridWorld(
-        task=task,
-        axis="delay" if named["axis"] == "delay" else "cue",
-        level=int(named["level"]),
-        first_inference_step=int(named["first"]),
-        phases=fixed_phases(task_spec(task), config.env),
-        config=config,
+    return ProbedWorld(
+        change=named["axis"], level=int(named["level"]), first_inference_step=int(named["first"])
     )
 
 
@@ -151,6 +146,7 @@ def _worlds(spec: TaskSpec, config: EvalConfig, settings: GridSettings, axis: Ax
                 n_action_steps=own,
                 env=env,
                 chunking=replace(config.chunking, first_inference_step=first),
+                world=ProbedWorld(change=axis, level=level, first_inference_step=first),
             )
             yield GridWorld(
                 task=spec.id,

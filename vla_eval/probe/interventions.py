@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.config.appearance import AS_DESIGNED
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.errors import RecipeError
 from vla_eval.probe.worlds import APPEARANCES, AS_DRAWN, Intervention, ProbeSettings, TaskWorlds, World
 from vla_eval.tasks.catalog import task_spec
@@ -133,13 +133,13 @@ INTERVENTIONS: Mapping[Intervention, Rule] = {
 }
 
 
-def named_world(task: str, name: str, config: EvalConfig) -> World | None:
+def named_world(name: str) -> ProbedWorld | None:
     """Return the world that is called so, after its task; None if it is not the name of one."""
     for intervention in sorted((AS_DRAWN, *INTERVENTIONS), key=len, reverse=True):  # `delay_swap` first
         if name == intervention or name.startswith(f"{intervention}_"):
             text = name.removeprefix(intervention).removeprefix("_")
             level = None if not text else int(text) if text.isdecimal() else text
-            return World(task=task, intervention=intervention, level=level, config=config)
+            return ProbedWorld(change=intervention, level=level)
     return None
 
 

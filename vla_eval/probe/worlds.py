@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 from vla_eval.config.appearance import AppearanceSettings
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.cue_view import CueViewKind
 from vla_eval.probe.phases import Phases, default_delay_steps, fixed_phases
 from vla_eval.tasks.spec import TaskSpec
@@ -171,6 +171,7 @@ class TaskWorlds:
             tasks=(self.spec.id,),
             policies=tuple(policies),
             env={**delay, **self.config.env, **(env or {})},
+            world=ProbedWorld(change=intervention, level=level),
             **fields,
         )
         return World(task=self.spec.id, intervention=intervention, level=level, config=config)
