@@ -331,6 +331,22 @@ def test_modules_of_a_documented_pythonpath_are_imported(
     sys.modules.pop("my_own_policy")
 
 
+def test_installed_modules_are_compiled_once_also_if_none_of_their_folder_was_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The folder for compiled modules is not there in a fresh checkout; elsewhere none is made."""
+    monkeypatch.setattr(sys, "dont_write_bytecode", False)
+    monkeypatch.syspath_prepend(tmp_path / "installed")
+    (tmp_path / "installed").mkdir()
+    (tmp_path / "installed" / "compiled_once.py").write_text("answer = 42")
+    with locked():
+        assert importlib.import_module("compiled_once").answer == 42
+        with pytest.raises(LockedError):
+            (tmp_path / "__pycache__").mkdir()
+    sys.modules.pop("compiled_once")
+    assert list((tmp_path / "installed" / "__pycache__").glob("compiled_once.*.pyc"))
+
+
 def test_what_libraries_need_goes_on() -> None:
     import ctypes.util
     from collections import namedtuple

@@ -54,7 +54,7 @@ FIRST_STEPS = f"""{PROGRAM} {__version__}: does a robot policy remember?
 `{PROGRAM} list` shows tasks and policies, `{PROGRAM} --help` every verb."""
 PATHS_FAULT = {
     *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.EACCES, errno.EPERM, errno.EROFS),
-    *(errno.ENOSPC, errno.EDQUOT),
+    *(errno.ENOSPC, errno.EDQUOT, errno.EEXIST),  # the last: a file where a folder is to be
 }
 """What the system says of a path that a user named, and not of a mistake of ours."""
 _LONG_WORD = re.compile(rf"(\S{{{MAX_SHOWN}}})\S{{{MAX_SHOWN},}}")

@@ -115,7 +115,9 @@ def _place(path: Any, folder: Any) -> str:
 
 def _make_folder(path: Any, _mode: Any, folder: Any = -1) -> None:
     place = _place(path, folder)
-    if not any(named.startswith(f"{place}/") for named in STATE.writes):  # the folder above a named one
+    is_above_a_named_one = any(named.startswith(f"{place}/") for named in STATE.writes)
+    is_for_compiled_modules = os.path.basename(place) == "__pycache__" and may_run(place)
+    if not (is_above_a_named_one or is_for_compiled_modules):
         _write(path, folder)
 
 
