@@ -70,10 +70,15 @@ def test_the_rows_are_the_former_recipes_beside_the_recipes_that_they_differ_fro
 
 
 def test_the_command_line_takes_a_former_name_and_says_which_row_it_is(
-    recorded: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     seen = tiny_trainings.asked_for(monkeypatch)
-    assert main(["finetune", "--policy", "octo_small_window2", "--dataset", str(recorded)]) == 0
+    base = tmp_path / "base"  # only looked for
+    base.mkdir()
+    for name in ("config.json", "model.safetensors"):
+        (base / name).touch()
+    finetune = ["finetune", "--policy", "octo_small_window2", "--dataset", str(recorded)]
+    assert main([*finetune, "--base-checkpoint", str(base)]) == 0
     assert load_finetune_recipe(seen[0]).value.policy["window"] == 2
     assert "--policy octo_small_window2" in caplog.text
 

@@ -13,6 +13,7 @@ from vla_eval.workers.cluster import pool as pool_module
 from vla_eval.workers.cluster.actor import Place
 from vla_eval.workers.cluster.machines import Machine
 from vla_eval.workers.cluster.pool import MAX_JOBS_PER_CALL, MAX_LOSSES, ClusterPool
+from vla_eval.workers.inside import RunnerClass
 from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.messages import Failed
 from vla_eval.workers.process import WorkerSpec
@@ -104,7 +105,9 @@ class OneMachine:
 def run(ray: StandIn, jobs: Sequence[Job], monkeypatch: pytest.MonkeyPatch) -> list[Answered[Job, Any]]:
     monkeypatch.setattr(pool_module, "on_machine", lambda node: node)
     place = Place(folder=".", variables={}, path=(), logs=str(Path.cwd()))
-    spec = WorkerSpec(main=print, answers=(), timeouts=TimeoutConfig(), logs=Path.cwd())
+    spec = WorkerSpec(
+        runner=RunnerClass(target="builtins:print"), answers=(), timeouts=TimeoutConfig(), logs=Path.cwd()
+    )
     pool: ClusterPool[Job, Any] = ClusterPool(ray, OneMachine(), spec, place, size=2)  # type: ignore[arg-type]
     with pool as running:
         return [event for event in running.run(JobList(jobs)) if isinstance(event, Answered)]

@@ -108,7 +108,7 @@ class TestOriginal:
         # safetensors keeps one of the two names of T5's embeddings.
         named = {key.replace("language.encoder.embed_tokens", "language.shared") for key in first}
         assert named == {our_name(key) for key in kept}
-        assert main(["checkpoint", "verify", str(tmp_path / "one-out")]) == 0
+        assert main(["checkpoint", "verify", "--verbose", str(tmp_path / "one-out")]) == 0
         said = capsys.readouterr().out
         assert "1 × 4 × 7 actions" in said and "action.mean, action.std" in said
         assert f"{sum(x.numel() for x in kept.values()):,}" in said
