@@ -223,3 +223,20 @@ def test_the_page_on_python_works_as_a_script(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert done.stdout.splitlines()[-1] == "18"  # three policies, three K, two episodes
     assert (tmp_path / "runs" / "mine-report" / "index.html").is_file()
+
+
+class Raises(Still):
+    """Divides by zero at the third control step."""
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        1 / (2 - window.last.step)
+        return super().act(window)
+
+
+@pytest.mark.parametrize("in_process", [False, True])
+def test_an_exception_names_the_line_of_the_policy_and_the_step(in_process: bool, tmp_path: Path) -> None:
+    lines = Path(__file__).read_text(encoding="utf-8").splitlines()
+    number = next(i for i, line in enumerate(lines, start=1) if line.strip().startswith("1 / (2 -"))
+    run = vla_eval.evaluate(policy=Raises, tasks=TASK, out=tmp_path / "run", in_process=in_process, **FAST)
+    said = f"division by zero (test_evaluate.py, line {number}, at control step 2)"
+    assert [record.error and record.error.message for record in run.records] == [said] * 3

@@ -144,8 +144,8 @@ def test_an_exception_of_any_size_is_recorded_in_part(bench: Bench) -> None:
 
     errors = {seed: record.error for seed, record in bench.records("out").items()}
     assert errors[1] is not None and errors[2] is not None
-    assert errors[1].message == "x" * 20_000 + " … (9,980,000 characters left out)"
-    assert errors[2].message == "its message cannot be read (ZeroDivisionError)"
+    assert errors[1].message.startswith("x" * 20_000 + " … (9,980,000 characters left out) (")
+    assert errors[2].message.startswith("its message cannot be read (ZeroDivisionError) (")
     assert (bench.folder / "out" / "episodes.jsonl").stat().st_size < 100_000
 
 

@@ -29,14 +29,14 @@ from vla_eval.evaluation.job_queue import EpisodeBatch
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
-from vla_eval.records import EpisodeRecord, EpisodeTiming
+from vla_eval.records import EpisodeError, EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.seeding import seed_global_generators
 from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.inside import Heartbeat
-from vla_eval.workers.messages import DeviceFound, Failed, Notice, describe_error
+from vla_eval.workers.messages import DeviceFound, Failed, Notice, describe_error, own_line
 
 logger = logging.getLogger(__name__)
 
@@ -114,7 +114,17 @@ class EpisodeRunner:
             return self._run(env, policy, job)
         except BaseException as exc:  # also SystemExit: a policy must not end the worker unseen
             logger.exception("%s, stage %s", [one.key for one in job.jobs], self._heartbeat.stage)
-            return Failed(error=describe_error(exc, self._heartbeat.stage), refused=refused)
+            return Failed(error=self._described(exc, job), refused=refused)
+
+    def _described(self, exc: BaseException, job: EpisodeBatch) -> EpisodeError:
+        """Return what is recorded: of an exception in the user's own code also the line and the step."""
+        error = describe_error(exc, self._heartbeat.stage)
+        line = None if isinstance(exc, VlaEvalError) else own_line(exc)
+        if line is None:
+            return error
+        knows_step = len(job.jobs) == 1 and error.stage in ("step", "inference")
+        at = f", at control step {self._heartbeat.n_counted}" if knows_step else ""
+        return dataclasses.replace(error, message=f"{error.message} ({line}{at})")
 
     def close(self) -> None:
         """Release the simulator."""

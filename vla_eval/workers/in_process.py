@@ -26,6 +26,7 @@ class InProcessPool[J: Job, A]:
 
     def __init__(self, spec: WorkerSpec) -> None:
         self._spec = spec
+        self._shared = cast(SharedStage, RawArray("d", SHARED_SIZE))
         self._runner: Runner | None = None
         self._loaded: Hashable | None = None
 
@@ -43,9 +44,9 @@ class InProcessPool[J: Job, A]:
             assert job is not None  # the queue was not empty
             if self._runner is None or self._loaded != job.setup_key:
                 self._close()
-                shared = cast(SharedStage, RawArray("d", SHARED_SIZE))
-                self._runner = self._spec.runner.make(Heartbeat(shared), found.append)
+                self._runner = self._spec.runner.make(Heartbeat(self._shared), found.append)
                 self._loaded = job.setup_key
+            self._shared[2] = 0  # what is counted of the job
             with global_generators_kept():
                 answer = self._runner.answer(job)
             if isinstance(answer, Failed):

@@ -55,6 +55,11 @@ class Heartbeat:
         add_count(self._shared, 1)
 
     @property
+    def n_counted(self) -> int:
+        """How many were counted of this job."""
+        return round(self._shared[2])
+
+    @property
     def stage(self) -> Stage:
         """The stage that was begun last."""
         return self._stage or "setup"

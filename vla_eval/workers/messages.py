@@ -1,14 +1,21 @@
 """Messages of a worker other than its answers: failed, found out something. Does not know what a job is."""
 
+import sysconfig
 import traceback
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 from vla_eval import errors
 from vla_eval.core import Stage
 from vla_eval.errors import VlaEvalError
 from vla_eval.records import EpisodeError
 
+_NOT_THE_USERS = (
+    str(Path(errors.__file__).parent),
+    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
+    "<",  # as Python calls what is not in a file
+)
 MAX_DETAILS = 20_000  # characters of a traceback or a message; the log has it all
 MAX_KIND = 200  # characters of an exception's class
 
@@ -53,6 +60,13 @@ def describe_error(exc: BaseException, stage: Stage) -> EpisodeError:
         message=message or f"{type(exc).__name__[:MAX_KIND]} without a message",
         details="".join(traceback.format_exception(exc))[-MAX_DETAILS:],
     )
+
+
+def own_line(exc: BaseException) -> str | None:
+    """Return file and line where the user's own code was when it was raised; None if it was not there."""
+    frames = reversed(traceback.extract_tb(exc.__traceback__))
+    own = next((frame for frame in frames if not frame.filename.startswith(_NOT_THE_USERS)), None)
+    return None if own is None else f"{Path(own.filename).name}, line {own.lineno}"
 
 
 def as_exception(error: EpisodeError) -> VlaEvalError:
