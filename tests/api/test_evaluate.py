@@ -178,6 +178,8 @@ class Unpicklable(Still):
         ({"policy": lambda: Still()}, "a lambda has no name"),
         ({"policy": Unpicklable()}, "cannot .*pickle.*Give the class"),
         ({"policy": {"a/b": Still()}}, "a/b"),
+        ({"policy": {"cue_blind": Still()}}, "my_cue_blind"),
+        ({"policy": Still("oracle")}, "my_oracle"),
         ({"policy": "oracel"}, "oracle"),
         ({"policy": "oracle", "tasks": "RememberColour3-v0"}, "RememberColor3-v0"),
         ({"policy": "oracle", "episode": 3}, "episodes"),

@@ -19,7 +19,7 @@ from typing import Any  # whatever the user gives, and what it consists of
 
 import cloudpickle
 
-from vla_eval.config.files import Recipe, check_recorded_name
+from vla_eval.config.files import Recipe, check_recorded_name, list_recipes
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.core import Policy
 from vla_eval.errors import RecipeError
@@ -74,6 +74,10 @@ def given_entry(found: object, *, name: str | None = None) -> PolicyEntry:
     """
     name = name or _name_of(found)
     check_recorded_name(name, kind="policy")
+    if name in list_recipes("policies"):  # tables know `oracle` and `cue_blind` by their names
+        raise RecipeError(
+            f"policy '{name}': policies/ has a recipe of this name. Give another: policy={{'my_{name}': …}}"
+        )
     try:
         pickled = cloudpickle.dumps(found)
     except Exception as exc:  # whatever the objects in it raise
