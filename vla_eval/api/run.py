@@ -11,7 +11,7 @@ from vla_eval.errors import unknown_name
 from vla_eval.page.build import write_page
 from vla_eval.page.material import gather
 from vla_eval.page.rates import success_plots
-from vla_eval.page.svg import PALETTE
+from vla_eval.page.svg import FONT_SIZE_PX, PALETTE
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.formats import By, Format, Preset
 from vla_eval.results.report import build_table, render
@@ -151,9 +151,10 @@ class Run:
         colors = "; ".join(f"--{name}: {color}" for name, color in PALETTE.items())
         charts = [chart.svg for chart in success_plots(material).charts]
         table = Markup(render(material.table, "html-table"))
-        parts = Markup("\n").join([table, *said, *charts])
-        # A notebook has none of the page's styles: the drawings' colors are named here.
-        return str(Markup('<div style="{}">{}</div>').format(colors, parts))
+        # A notebook has none of the page's styles: size of letters and colors of drawings are set here.
+        style = f"font-size: {FONT_SIZE_PX}px; {colors}"
+        plots = Markup('<div style="{}">{}</div>').format(style, Markup("\n").join(charts))
+        return str(Markup("\n").join([table, *said, plots]))
 
 
 def load_run(*folders: str | Path) -> Run:
