@@ -123,10 +123,10 @@ def identity_elsewhere(code: str, file_name: str) -> str:
 
 
 def test_the_same_cell_is_the_same_policy_in_another_kernel_and_what_it_uses_counts() -> None:
-    first = identity_elsewhere(CELLS.format(limit=1), "/tmp/ipykernel_1/1.py")
-    assert first == identity_elsewhere("\n\n" + CELLS.format(limit=1), "/tmp/ipykernel_2/7.py")
-    assert first != identity_elsewhere(CELLS.format(limit=2), "/tmp/ipykernel_1/1.py")
-    assert first != identity_elsewhere(CELLS.format(limit=1).replace("==", "!="), "/tmp/ipykernel_1/1.py")
+    first = identity_elsewhere(CELLS.format(limit=1), "ipykernel_1/1.py")
+    assert first == identity_elsewhere("\n\n" + CELLS.format(limit=1), "ipykernel_2/7.py")
+    assert first != identity_elsewhere(CELLS.format(limit=2), "ipykernel_1/1.py")
+    assert first != identity_elsewhere(CELLS.format(limit=1).replace("==", "!="), "ipykernel_1/1.py")
 
 
 def test_an_attribute_changes_the_identity_of_an_instance() -> None:

@@ -1,6 +1,7 @@
 """`vla_eval.evaluate`: `mikasa-vla eval` from Python, also for a policy that is a Python object."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any  # policies are whatever the user gives; plain data
 
@@ -64,8 +65,7 @@ def evaluate(
     objects = {one.name: one.recipes[0].sha256 for one in entries if isinstance(one, PolicyEntry)}
     if objects and out is None:  # another version of the class is another run
         digest = digest_of([resolved.fingerprint, objects])[:FINGERPRINT_DIGITS]
-        folder = RUNS_FOLDER / f"{read.name}-{digest}"
-        resolved = ResolvedEvaluation.of(read, policies, backend=backend, out=folder)
+        resolved = replace(resolved, named_out=RUNS_FOLDER / f"{read.name}-{digest}")
     with stop_on_signals() as stop:
         summary = evaluate_with_progress(
             resolved,

@@ -200,6 +200,7 @@ class EpisodeRunner:
     def _make_env(self, settings: EnvSettings, described: EnvSpec) -> SimEnv:
         env = make_env(settings)
         if env.spec != described:
+            env.close()
             raise SpecMismatchError(
                 f"{settings.task}: expected an environment as row and arguments describe it, {described}; "
                 f"found {env.spec}. The policy was made for the first. If the task is of another package: "

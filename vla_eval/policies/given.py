@@ -11,7 +11,6 @@ import io
 import pickle
 import re
 import sys
-import sysconfig
 import types
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,11 +27,11 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.recipe import BIG_CHECKPOINT_BYTES
 from vla_eval.policies.registry import takes_a_context
+from vla_eval.workers.messages import INSTALLED
 
 ADAPTER = "vla_eval.policies.given:make_given"
 MEMBERS = ("spec", "reset", "act")
 _CLASS_ID = re.compile("[0-9a-f]{32}")  # cloudpickle draws one for each class of a notebook
-_INSTALLED = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib", "purelib", "platlib"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +108,7 @@ def identity_of(found: object) -> str:
     modules = {one.__module__ for one in of_class.__mro__} | {getattr(found, "__module__", "")}
     for module in sorted(modules - {"__main__"}):
         path = getattr(sys.modules.get(module), "__file__", None)
-        if path is not None and not path.startswith(_INSTALLED):
+        if path is not None and not path.startswith(INSTALLED):
             digest.update(Path(path).read_bytes())
     return digest.hexdigest()
 

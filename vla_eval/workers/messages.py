@@ -11,11 +11,9 @@ from vla_eval.core import Stage
 from vla_eval.errors import VlaEvalError
 from vla_eval.records import EpisodeError
 
-_NOT_THE_USERS = (
-    str(Path(errors.__file__).parent),
-    *(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib")),
-    "<",  # as Python calls what is not in a file
-)
+INSTALLED = tuple(sysconfig.get_path(name) for name in ("stdlib", "platstdlib", "purelib", "platlib"))
+"""The folders of Python's own modules and of installed packages: what lies there is not the user's."""
+_NOT_THE_USERS = (str(Path(errors.__file__).parent), *INSTALLED, "<")  # "<": what is not in a file
 MAX_DETAILS = 20_000  # characters of a traceback or a message; the log has it all
 MAX_KIND = 200  # characters of an exception's class
 
