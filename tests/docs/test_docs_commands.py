@@ -86,7 +86,7 @@ def check_names(args: argparse.Namespace) -> None:
         config = verb._config(args)
         for task in config.tasks:
             check_task(task, dict(config.env))
-        for policy in filter(is_name, config.policies):
+        for policy in filter(is_name, (one.partition("=")[2] or one for one in config.policies)):
             find_recipe("policies", policy)
     elif args.verb == "record":
         recipe = verb._recipe(args)

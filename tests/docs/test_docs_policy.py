@@ -1,4 +1,4 @@
-"""The example of `docs/policies.md`, word for word."""
+"""The policies of `docs/policies.md` and of the README, word for word."""
 
 import re
 import subprocess
@@ -31,3 +31,18 @@ def test_the_example_policy_passes_the_check_and_is_evaluated(tmp_path: Path) ->
         "--set", "simulator=fake", "--format", "csv",
     )  # fmt: skip
     assert table.count("my_policy") == 2
+
+
+def test_the_policy_of_the_readme_is_evaluated(tmp_path: Path) -> None:
+    (policy,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    assert len(re.findall(r"^.*\S", policy, re.M)) <= 10
+    small = 'n_action_steps=[1, 4, 8], episodes=2, workers=1, simulator="fake", out="run")'
+    script = policy.replace("n_action_steps=[1, 4, 8])", small)
+    script += "print(vla_eval.load_run('run').table('csv'))"
+    (tmp_path / "mine.py").write_text(script)
+    environment = {"PYTHONPATH": str(ROOT), "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+    command = [sys.executable, "mine.py"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    rows = [line for line in done.stdout.splitlines() if ",Mine," in line]
+    assert len(rows) == 3

@@ -7,8 +7,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from vla_eval import __version__
 
 ROOT = Path(__file__).parents[2]
 
@@ -82,12 +85,28 @@ def test_the_changelog_names_changes_that_affect_results() -> None:
     assert "### Results-affecting" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
 
 
+def test_the_readme_is_read_in_three_minutes() -> None:
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert len(text.split()) <= 800
+    assert len(re.findall(r"(?<!!)\[[^]]+\]\([^)]+\)", text)) == 8  # links, without the image
+
+
+def test_the_citation_is_of_this_version_and_names_the_paper() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert (citation["cff-version"], citation["title"]) == ("1.2.0", project["name"])
+    assert (citation["version"], citation["license"]) == (__version__, project["license"])
+    assert [one["name"] for one in citation["authors"]] == [one["name"] for one in project["authors"]]
+    (paper,) = citation["references"]
+    assert paper["title"].startswith("Memory, Benchmark & Robots")
+
+
 OF_NO_ROOM = {"docs", "packaging", "fuzz", "gpu", "golden", "peers"}
 """Folders of tests that are neither of a room nor of a distribution in `plugins/`."""
 
 
-def test_the_tree_of_the_readme_is_the_tree() -> None:
-    tree = (ROOT / "README.md").read_text(encoding="utf-8").split("```")
+def test_the_tree_of_the_code_that_contributors_see_is_the_tree() -> None:
+    tree = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").split("```")
     shown = next(block for block in tree if "vla_eval/\n" in block)
     package = ROOT / "vla_eval"
     rooms = {f"{file.parent.name}/" for file in package.glob("*/__init__.py")}
@@ -95,7 +114,7 @@ def test_the_tree_of_the_readme_is_the_tree() -> None:
     missing = [name for name in sorted({*rooms, *files}) if not re.search(rf"(^|\s){re.escape(name)}", shown)]
     assert not missing
     named = set(re.findall(r"^  (\w+/)", shown, flags=re.MULTILINE))
-    assert named <= rooms  # a room that is gone is gone from the README
+    assert named <= rooms  # a room that is gone is gone from the page
 
 
 def test_a_folder_of_tests_is_of_a_room_or_of_a_plugin() -> None:
