@@ -1,6 +1,7 @@
 """Whole runs on the fake simulator: the same lines however they are run, resumed as what they were."""
 
 import json
+from collections import Counter
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from vla_eval.cli.main import main
 from vla_eval.errors import RunChangedError
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.report import build_table
 from vla_eval.storage.run_folder import read_run
 from vla_eval.workers.load import Load
 
@@ -243,6 +245,30 @@ class TestRunSeeds:
         assert (bench.folder / "grown/episodes.jsonl").read_bytes().startswith(begun)
         with pytest.raises(RunChangedError, match=r"config\.policies"):
             bench.run("grown", policies=[f"mine={','.join(reversed(paths))}"], episodes=2)
+
+
+class TestOneCheckpointPerTask:
+    def test_a_run_grows_by_a_task_with_its_checkpoint_and_refuses_another_one(self, bench: Bench) -> None:
+        color, shell = "RememberColor3-v0", "ShellGameTouch-v0"
+        first, second, third = (bench.write_policy(name=name, pause=i / 1e6) for i, name in enumerate("abc"))
+        own = f"mine:{color}={first}"
+        bench.run("grown", tasks=[color], policies=[own, "oracle"], episodes=2)
+        begun = (bench.folder / "grown/episodes.jsonl").read_bytes()
+
+        both = {"tasks": [color, shell], "policies": [own, "oracle", f"mine:{shell}={second},{third}"]}
+        bench.run("grown", **both, episodes=2)
+        bench.run("at once", **both, episodes=2)
+
+        assert bench.lines("grown") == bench.lines("at once")
+        assert (bench.folder / "grown/episodes.jsonl").read_bytes().startswith(begun)
+        rows = Counter((r.task, r.policy, r.run) for r in read_run(bench.folder / "grown").records)
+        assert rows[shell, "mine", 1] == rows[shell, "mine", 0] == rows[color, "mine", 0] == 2
+        assert (
+            "mine: another checkpoint for each task." in build_table([read_run(bench.folder / "grown")]).notes
+        )
+        second.write_text(second.read_text() + "\n")
+        with pytest.raises(RunChangedError, match=rf"recipes\.policies/mine/{shell}/run-0"):
+            bench.run("grown", **both, episodes=2)
 
 
 # ------------------------------------------------------------------------------------------ command line

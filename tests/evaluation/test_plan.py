@@ -1,6 +1,7 @@
 """What an evaluation will run, in which order, and what two runs are compared by."""
 
 from collections import Counter
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -123,6 +124,70 @@ class TestRunSeeds:
     def test_a_name_for_one_checkpoint_is_its_name_in_records(self) -> None:
         (job,) = make_plan(config(policies=["mine=random"], episodes=1)).jobs
         assert (job.key.policy, job.key.run, job.group.adapter) == ("mine", 0, "random")
+
+
+class TestOneCheckpointPerTask:
+    TASKS = ("RememberColor3-v0", "ShellGameTouch-v0")
+
+    def test_a_mapping_and_entries_for_single_tasks_say_the_same(self) -> None:
+        color, shell = self.TASKS
+        entries = ["hold", f"mine:{color}=a,b", f"mine:{shell}=c"]
+
+        written = decode(
+            EvalConfig,
+            {
+                "name": "n",
+                "tasks": list(self.TASKS),
+                "policies": ["hold", {"mine": {color: ["a", "b"], shell: "c"}}],
+            },
+            where="x",
+        )
+
+        assert written == config(name="n", tasks=list(self.TASKS), policies=entries)
+        assert decode(EvalConfig, to_data(written), where="x") == written
+
+    @pytest.mark.parametrize(
+        "entry", [3, {"mine": 3}, {"mine": {"A-v0": []}}, {"mine": {"A-v0": [1]}}, {3: "a"}]
+    )
+    def test_an_entry_that_is_neither_names_what_may_stand_there(self, entry: object) -> None:
+        with pytest.raises(RecipeError, match=r"policies.*expected (text|names, or NAME: {TASK: DIR})"):
+            decode(EvalConfig, {"name": "n", "tasks": ["A-v0"], "policies": [entry]}, where="x")
+
+    def test_each_task_has_the_recipe_and_the_runs_of_its_own_checkpoints(self, tmp_path: Path) -> None:
+        color, shell = self.TASKS
+        policies = ["hold", f"mine:RememberColor3=random,{random_again(tmp_path)}", f"mine:{shell}=hold"]
+
+        plan = make_plan(config(tasks=list(self.TASKS), policies=policies, episodes=1))
+
+        adapters = {(job.key.task, job.key.policy, job.key.run): job.group.adapter for job in plan.jobs}
+        assert adapters == {
+            (color, "hold", 0): "hold",
+            (color, "mine", 0): "random",
+            (color, "mine", 1): "random",
+            (shell, "hold", 0): "hold",
+            (shell, "mine", 0): "hold",
+        }
+        assert plan.policy_names == ("hold", "mine")
+        again = sha256(random_again(tmp_path).read_bytes()).hexdigest()
+        assert plan.recipe_hashes[f"policies/mine/{color}/run-1"] == again
+        assert plan.recipe_hashes[f"policies/mine/{shell}/run-0"] == plan.recipe_hashes["policies/hold"]
+
+    @pytest.mark.parametrize(
+        ("more", "message"),
+        [
+            (
+                (),
+                r"found those for RememberColor3-v0 and none for ShellGameTouch-v0. Add mine:Shell",
+            ),
+            (("mine=random",), r"'mine' is named twice, once for all tasks"),
+            (("mine:RememberColor3=hold",), r"'mine/RememberColor3-v0' is named twice"),
+            (("mine:RememberColour3-v0=random",), r"Did you mean 'RememberColor3-v0'"),
+            (("mine:ShellGameTouch-v0=nothing",), r"no policies/\*.yaml 'nothing'"),
+        ],
+    )
+    def test_a_mistake_is_found_while_planning(self, more: tuple[str, ...], message: str) -> None:
+        with pytest.raises((RecipeError, UnknownNameError), match=message):
+            make_plan(config(tasks=list(self.TASKS), policies=["mine:RememberColor3-v0=random", *more]))
 
 
 def random_again(folder: Path) -> Path:

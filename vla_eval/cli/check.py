@@ -79,6 +79,6 @@ def _check_policy(args: argparse.Namespace) -> list[str]:
             "--api-key-env and --timeout-seconds are for the address of a server, ws://HOST:PORT."
         )
     say = functools.partial(print, file=sys.stderr, flush=True)
-    return check_recipe(
-        load_policy_entry(args.policy), task=args.task or DEFAULT_TASK, report=_print_met, say=say
-    )
+    policy = load_policy_entry(args.policy)
+    task = args.task or policy.task or DEFAULT_TASK
+    return check_recipe(policy, task=task, report=_print_met, say=say)

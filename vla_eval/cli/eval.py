@@ -69,7 +69,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         task="task ids (`mikasa-vla list tasks`)",
         policy="names in policies/, files, folders of checkpoints, or ws://HOST:PORT of a policy server; "
-        "NAME=DIR,DIR,DIR: one row whose runs are these checkpoints",
+        "NAME=DIR,DIR,DIR: one row whose runs are these checkpoints; NAME:TASK=DIR, several: one per task",
         n_action_steps="actions executed per inference; several: one after another",
         episodes="episodes per task, policy and run (100)",
     )

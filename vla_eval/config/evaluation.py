@@ -1,5 +1,6 @@
 """`configs/*.yaml`: one evaluation."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
@@ -21,6 +22,7 @@ from vla_eval.strict.bounds import (
     check_seeds,
     require,
 )
+from vla_eval.strict.decoding import read_by
 from vla_eval.strict.renamed import formerly
 
 
@@ -56,13 +58,30 @@ class ProbedWorld:
         require(not in_grid or isinstance(self.level, int), "level", self.level, "a number, in a grid")
 
 
+def _one_text_each(policies: Any) -> Any:  # Any: plain data of YAML, not yet checked
+    """Return entries `mine: {TASK: DIR}` as the texts `mine:TASK=DIR`, and all others as they are."""
+    if not isinstance(policies, list):
+        return policies
+    return [one for entry in policies for one in (_texts(entry) if isinstance(entry, dict) else [entry])]
+
+
+def _texts(entry: dict[str, Any]) -> Iterator[str]:
+    for name, by_task in entry.items():
+        for task, named in by_task.items() if isinstance(by_task, dict) else [("", by_task)]:
+            several = named if isinstance(named, list) else [named]
+            found = {name: by_task}
+            is_text = bool(several) and all(isinstance(one, str) for one in (name, task, *several))
+            require(is_text, "policies", found, "names, or NAME: {TASK: DIR}, or NAME: {TASK: [DIR, DIR]}")
+            yield f"{name}:{task}={','.join(several)}" if task else f"{name}={','.join(several)}"
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvalConfig:
     """`configs/*.yaml`: one evaluation. `docs/evaluation.md` has the table of all keys."""
 
     name: str
     tasks: tuple[str, ...]
-    policies: tuple[str, ...]
+    policies: tuple[str, ...] = field(metadata=read_by(_one_text_each))
     description: str = ""
     protocol: str | None = None
     n_action_steps: tuple[int, ...] | None = None

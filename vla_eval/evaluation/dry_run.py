@@ -87,7 +87,7 @@ def evaluation_effort(
     checkpoints = _checkpoints(plan)
     reads = images_read(resolved.policies)
     rendered = [
-        n_rendered(job, config, reads=reads[job.group.key.policy], n_steps=n_steps)
+        n_rendered(job, config, reads=reads[job.group.part], n_steps=n_steps)
         for job, n_steps in zip(ahead, steps, strict=True)
     ]
     learned = [n for job, n in zip(ahead, inferences, strict=True) if LEARNED in job.group.args]
@@ -146,7 +146,7 @@ def horizons(jobs: Sequence[EpisodeJob]) -> list[int]:
 
 
 def _checkpoints(plan: Plan) -> dict[str, Path]:
-    named = {job.group.key.policy: job.group.args.get(LEARNED) for job in plan.jobs}
+    named = {job.group.part: job.group.args.get(LEARNED) for job in plan.jobs}
     return {policy: find_checkpoint(Path(str(path))) for policy, path in named.items() if path is not None}
 
 

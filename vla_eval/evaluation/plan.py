@@ -23,13 +23,14 @@ from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.cue_view import CueViewSettings
 from vla_eval.envs.factory import describe_env
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, some_of
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.resolve import ResolvedEvaluation, has_weights
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
 from vla_eval.seeding import SeedRange
+from vla_eval.storage.planned import part_of
 from vla_eval.storage.shard import Shard
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.strict.bounds import MAX_EPISODES
@@ -46,7 +47,8 @@ class Plan:
         jobs: every episode, in a fixed order.
         recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
             policies, and the datasets that these were trained on (another dataset of the same name is
-            `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on.
+            `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on,
+            those for one task `policies/NAME/TASK/run-0`.
         normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
         servers: policy behind a socket -> its server's metadata.
         sentences: policy with weights, one of several checkpoints as in `recipe_hashes` -> those it was
@@ -114,7 +116,8 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
     _refuse_doubles("tasks", [task.id for task in tasks])
-    _refuse_doubles("policies", [policy.name for policy in policies])
+    _refuse_doubles("policies", [part_of(one.name, task=one.task) for one in policies])
+    _check_tasks(tasks, policies)
     _check_runs(config, policies)
     prompts = load_prompts(config.prompt_set)
     servers = {policy.name: policy.server for policy in policies if policy.server is not None}
@@ -136,7 +139,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
             **{name: server.training_seeds for name, server in servers.items() if server.training_seeds},
         },
         task_versions={task.id: task.version for task in tasks},
-        policy_names=tuple(policy.name for policy in policies),
+        policy_names=tuple(dict.fromkeys(policy.name for policy in policies)),
         shared=shared,
         left_out=tuple(left_out),
         max_workers=_max_workers(policies, shared),
@@ -169,7 +172,7 @@ def _groups_of_all(
     for task in tasks:
         describe_env(_env_settings(config, task))
         instruction = sentences_of(prompts, task)[0]
-        for policy in policies:
+        for policy in _on(task, policies):
             check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and not task.has_candidates:
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
@@ -242,6 +245,28 @@ def _sentences(
 def _max_workers(policies: Sequence[PolicyEntry], shared: Mapping[str, str]) -> int | None:
     limits = [policy.value.max_workers for policy in policies if policy.part(0) not in shared]
     return min((limit for limit in limits if limit is not None), default=None)
+
+
+def _on(task: TaskSpec, policies: Sequence[PolicyEntry]) -> list[PolicyEntry]:
+    return [policy for policy in policies if policy.task in (None, task.id)]
+
+
+def _check_tasks(tasks: Sequence[TaskSpec], policies: Sequence[PolicyEntry]) -> None:
+    """Refuse a policy with checkpoints for single tasks that has none for one, or also one for all."""
+    for policy in policies:
+        own = [one.task for one in policies if one.name == policy.name]
+        missing = [task.id for task in tasks if None not in own and task.id not in own]
+        if missing:
+            raise RecipeError(
+                f"policies: expected a checkpoint of '{policy.name}' for each task, found those for "
+                f"{some_of(map(str, own))} and none for {some_of(missing)}. Add "
+                f"{policy.name}:{missing[0]}=DIR, or leave the task out."
+            )
+        if None in own and len(own) > 1:
+            raise RecipeError(
+                f"policies: '{policy.name}' is named twice, once for all tasks and once for "
+                f"{some_of(filter(None, own))}. Give the two different names."
+            )
 
 
 def _check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:

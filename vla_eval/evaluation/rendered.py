@@ -19,11 +19,16 @@ Reads = Literal["none", "last", "every"]
 
 
 def images_read(policies: Sequence[PolicyEntry]) -> dict[str, Reads]:
-    """Return the images that each policy of a configuration has to be given, by its name.
+    """Return the images that each policy of a configuration has to be given, by `EpisodeGroup.part`.
 
     Of an adapter of another package nothing is known: it is taken to read every step's.
     """
-    return {policy.name: _read_by(policy) for policy in policies}
+    return {
+        policy.part(index): reads
+        for policy in policies
+        for reads in [_read_by(policy)]
+        for index in range(len(policy.recipes))
+    }
 
 
 def n_rendered(job: EpisodeJob, config: EvalConfig, *, reads: Reads, n_steps: int) -> int:

@@ -1,6 +1,7 @@
 """The policies of a configuration, each read once, and a policy server asked once.
 
 `NAME=A,B,C` is one of several checkpoints: the same training with different run seeds, one run each.
+`NAME:TASK=A,B,C` are those for one task; such entries of one name are one policy with a checkpoint per task.
 """
 
 from collections.abc import Sequence
@@ -12,7 +13,8 @@ from vla_eval.errors import RecipeError
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.policies.remote.survey import survey, survey_address
-from vla_eval.storage.planned import named_checkpoints
+from vla_eval.storage.planned import named_checkpoints, part_of
+from vla_eval.tasks.catalog import task_spec, with_version
 from vla_eval.wire.addresses import named_server
 from vla_eval.wire.metadata import ServerMetadata
 
@@ -26,6 +28,7 @@ class PolicyEntry:
         recipes: one; or one per run, for a policy of several checkpoints.
         texts: what the configuration calls each of them.
         is_by_run: whether each recipe is a run of its own.
+        task: the id of the only task that it is for; None: all.
         server: of a policy behind a socket, its server's metadata.
     """
 
@@ -33,6 +36,7 @@ class PolicyEntry:
     recipes: tuple[Recipe[PolicyRecipe], ...]
     texts: tuple[str, ...]
     is_by_run: bool = False
+    task: str | None = None
     server: ServerMetadata | None = None
 
     @property
@@ -42,7 +46,7 @@ class PolicyEntry:
 
     def part(self, index: int) -> str:
         """Return the name of a recipe in `run.json`: those of several checkpoints are numbered."""
-        return f"{self.name}/run-{index}" if self.is_by_run else self.name
+        return part_of(self.name, task=self.task, run=index if self.is_by_run else None)
 
 
 def load_policy_entries(texts: Sequence[str]) -> tuple[PolicyEntry, ...]:
@@ -56,6 +60,7 @@ def load_policy_entry(text: str) -> PolicyEntry:
     Raises:
         RecipeError: the checkpoints of one policy are not of the same kind, or one stands there twice.
         RemoteChangedError: two servers of one policy are not of the same one.
+        UnknownNameError: there is no such policy, or no such task.
     """
     named = named_checkpoints(text)
     if named is None:
@@ -68,7 +73,8 @@ def load_policy_entry(text: str) -> PolicyEntry:
         if recipe.value.adapter == REMOTE_ADAPTER:
             raise _is_served(text, one)
     _check_alike(text, named.checkpoints, recipes)
-    return PolicyEntry(name=named.name, recipes=recipes, texts=named.checkpoints, is_by_run=True)
+    task = None if named.task is None else task_spec(with_version(named.task)).id
+    return PolicyEntry(name=named.name, recipes=recipes, texts=named.checkpoints, is_by_run=True, task=task)
 
 
 def _single(text: str) -> PolicyEntry:

@@ -7,8 +7,8 @@ from itertools import chain
 from typing import NamedTuple
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.planned import bare_name, bare_task
-from vla_eval.storage.run_file import leaves
+from vla_eval.storage.planned import bare_name, bare_task, parts_of
+from vla_eval.storage.run_file import JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
 
 VARIANT_FIELDS = (
@@ -21,7 +21,7 @@ POLICY_NAMES = "policy_names"  # the policies' names in records, in the configur
 TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
 PROMPTS = "prompts/"  # recipes whose names have this prefix hold the instructions
 WEIGHTS = "checkpoints/"  # recipes whose names have this prefix are the weights of a policy
-OF_RUN = "run-"  # with the run's number after the policy's name: one of its several checkpoints
+BASE = "base"  # after the policy's name: the base checkpoint of its adapter
 DIGITS = 8
 DEFAULT = "default"
 
@@ -150,7 +150,7 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
             if stored not in folders[key]:
                 folders[key].append(stored)
             n_copies = len(copies)
-            n_new = _place(copies, _Copy(_weights(stored, key.policy, index), records))
+            n_new = _place(copies, _Copy(_weights(stored, key, index), records))
             if n_new < len(records):
                 n_doubles[str(stored.path)] += len(records) - n_new
             if 0 < n_copies < len(copies):
@@ -164,17 +164,11 @@ def group_runs(runs: Sequence[StoredRun]) -> Grouping:
     )
 
 
-def _weights(stored: StoredRun, policy: str, index: int) -> frozenset[str]:
+def _weights(stored: StoredRun, key: RowKey, index: int) -> frozenset[str]:
     """Return the digests of a policy's weights in a run; none for a policy without weights."""
-    name = f"{WEIGHTS}{policy}"
-    of_run, of_runs = f"{name}/{OF_RUN}{index}", f"{name}/{OF_RUN}"
-    return frozenset(
-        digest
-        for key, digest in stored.description.recipes.items()
-        if key in (name, of_run)
-        or key.startswith(f"{of_run}/")
-        or (key.startswith(f"{name}/") and not key.startswith(of_runs))
-    )
+    parts = {f"{WEIGHTS}{part}" for part in parts_of(key.policy, task=key.task, run=index)}
+    own = {*parts, *(f"{part}/{BASE}" for part in parts)}
+    return frozenset(digest for name, digest in stored.description.recipes.items() if name in own)
 
 
 def _runs(by_index: Mapping[int, Sequence[_Copy]]) -> tuple[Run, ...]:
@@ -274,11 +268,15 @@ def config_names(run: StoredRun, field: str) -> tuple[str, ...]:
     config = run.description.config
     # A checkpoint is given as a folder; its name in records is known once it has been read.
     names = config.get(POLICY_NAMES) if field == "policies" else None
-    names = config.get(field) if names is None else names
-    if isinstance(names, str) or not isinstance(names, Sequence):
-        return ()
     bare = bare_task if field == "tasks" else bare_name
-    return tuple(bare(str(name)) for name in names)
+    return tuple(bare(name) for name in texts_of(config.get(field) if names is None else names))
+
+
+def texts_of(value: JsonValue) -> list[str]:
+    """Return the items of a list in a configuration; none of what is no list."""
+    if isinstance(value, str) or not isinstance(value, Sequence):
+        return []
+    return [str(item) for item in value]
 
 
 def _in_order(groups: Sequence[RowEpisodes], runs: Sequence[StoredRun]) -> list[RowEpisodes]:

@@ -6,8 +6,9 @@ from itertools import product
 from typing import NamedTuple
 
 from vla_eval.errors import MAX_NAMED, some_of
-from vla_eval.results.grouping import PROMPTS, Grouping, config_names
+from vla_eval.results.grouping import PROMPTS, Grouping, config_names, texts_of
 from vla_eval.results.own_statistics import count
+from vla_eval.storage.planned import named_checkpoints
 from vla_eval.storage.run_file import DEVICE, JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.trained_on import seen_in_training
@@ -40,13 +41,20 @@ def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
         "count as further runs."
     )
     notes += [(path, further) for path in grouping.further]
-    own: list[str] = []
+    own = [f"{name}: another checkpoint for each task." for name in _by_task(runs)]
     for run in runs:
         seen = seen_in_training((record.key for record in run.records), run.description.training_seeds)
         own += [*_incomplete(run), *_continued_elsewhere(run), *seen]
     sentences = dict.fromkeys(line for run in runs for session in run.sessions for line in session.sentences)
     differences = (*_environment_differences(runs), *_recipe_differences(runs))
     return [*_told_together(notes), *own, *sentences, *_absent_shards(runs), *differences]
+
+
+def _by_task(runs: Sequence[StoredRun]) -> list[str]:
+    """Return the policies that have checkpoints for single tasks."""
+    entries = [one for run in runs for one in texts_of(run.description.config.get("policies"))]
+    named = [named_checkpoints(one) for one in entries]
+    return list(dict.fromkeys(one.name for one in named if one is not None and one.task is not None))
 
 
 def _told_together(notes: Sequence[tuple[str, str]]) -> Iterator[str]:

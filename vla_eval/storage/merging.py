@@ -103,6 +103,6 @@ def _planned(part: ShardPart) -> Iterator[EpisodeKey]:
             f"found no such field. The file was changed by another program; restore it."
         )
     for group in shard.groups:
-        for run in range(config.n_runs(group[1]) or config.runs):
+        for run in range(config.n_runs(group[1], group[0]) or config.runs):
             for index in shard.indices(config.episodes):
                 yield EpisodeKey(*group, run, config.seed_start + index)

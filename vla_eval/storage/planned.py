@@ -14,20 +14,32 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.storage.shard import Shard
 from vla_eval.strict.json_text import Count, Positive, Source, as_dataclass
 
-_NAMED = re.compile(r"(?P<name>\w[\w.-]*)=(?P<checkpoints>.+)", re.DOTALL)
+OF_RUN = "run-"
+_NAMED = re.compile(r"(?P<name>\w[\w.-]*)(?::(?P<task>\w[\w./-]*))?=(?P<checkpoints>.+)", re.DOTALL)
 
 
 class NamedCheckpoints(NamedTuple):
-    """What `NAME=A,B,C` says: one policy whose runs 0, 1, 2 … are different checkpoints."""
+    """What `NAME=A,B,C` says: one policy whose runs 0, 1, 2 … are different checkpoints.
+
+    `NAME:TASK=A,B,C` says it for one task; the policy has another such entry for each further one.
+    """
 
     name: str
     checkpoints: tuple[str, ...]
+    task: str | None = None
+
+    def is_for(self, policy: str, task: str) -> bool:
+        """Whether records of this policy and task are of these checkpoints."""
+        own = task if self.task is None else bare_task(self.task)
+        return self.name == policy and own in (task, task.rpartition("-v")[0])  # named without a version
 
 
 def named_checkpoints(policy: str) -> NamedCheckpoints | None:
     """Read the entry of a policy in a configuration; None if it names a single one."""
     match = _NAMED.fullmatch(policy)
-    return NamedCheckpoints(match["name"], tuple(match["checkpoints"].split(","))) if match else None
+    if match is None:
+        return None
+    return NamedCheckpoints(match["name"], tuple(match["checkpoints"].split(",")), match["task"])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +48,8 @@ class PlannedConfig:
 
     Attributes:
         tasks: ids, maybe with their namespace; `task_versions`: id -> version of its rules.
-        policies: names, files or folders, or `NAME=A,B,C`; `policy_names`: what records call them.
+        policies: names, files, folders, `NAME=A,B,C` or `NAME:TASK=A,B,C`; `policy_names`: their names in
+            records.
         n_action_steps: None also where each policy has its default.
     """
 
@@ -49,10 +62,11 @@ class PlannedConfig:
     runs: Positive | None = None
     seed_start: Count | None = None
 
-    def n_runs(self, policy: str) -> int | None:
-        """Return how many runs a policy has: one per checkpoint if it was given several."""
+    def n_runs(self, policy: str, task: str) -> int | None:
+        """Return how many runs a policy has on a task: one per checkpoint if it was given several."""
         named = (named_checkpoints(entry) for entry in self.policies or ())
-        return next((len(one.checkpoints) for one in named if one and one.name == policy), self.runs)
+        own = (one for one in named if one is not None and one.is_for(policy, task))
+        return next((len(one.checkpoints) for one in own), self.runs)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +105,7 @@ class PlannedEpisodes:
             return f"n_action_steps are {some_of(config.n_action_steps)}"
         if self.groups is not None and key[:3] not in self.groups:
             return "no such policy is run on this task with these n_action_steps"
-        n_runs = config.n_runs(key.policy)
+        n_runs = config.n_runs(key.policy, task)
         if n_runs is not None and key.run >= n_runs:
             return f"the runs are 0 to {n_runs - 1}"
         if config.episodes is not None and config.seed_start is not None:
@@ -101,6 +115,16 @@ class PlannedEpisodes:
             if self.shard is not None and not self.shard.holds(key.seed - config.seed_start):
                 return f"the run is shard {self.shard}, and the seed is in another one"
         return None
+
+
+def part_of(policy: str, *, task: str | None = None, run: int | None = None) -> str:
+    """Return what `run.json` calls the checkpoint of a policy for a task and run, where it has several."""
+    return "/".join((policy, *filter(None, (task, None if run is None else f"{OF_RUN}{run}"))))
+
+
+def parts_of(policy: str, *, task: str, run: int) -> list[str]:
+    """Return all that the checkpoint of a record may be called in `run.json`."""
+    return [part_of(policy, task=one, run=number) for one in (None, task) for number in (None, run)]
 
 
 def bare_name(name: str) -> str:

@@ -9,9 +9,10 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from vla_eval.records import EpisodeKey
 from vla_eval.seeding import SeedRange
+from vla_eval.storage.planned import parts_of
 
 TrainingSeeds = Mapping[str, Mapping[str, Sequence[SeedRange]]]
-"""Policy, or `POLICY/run-N` of several checkpoints -> task id -> the seeds of its demonstrations."""
+"""Policy, or its part of a task or run (`part_of`) -> task id -> the seeds of its demonstrations."""
 
 
 def seen_in_training(keys: Iterable[EpisodeKey], known: TrainingSeeds) -> list[str]:
@@ -19,7 +20,8 @@ def seen_in_training(keys: Iterable[EpisodeKey], known: TrainingSeeds) -> list[s
     seen: dict[tuple[str, str], set[int]] = defaultdict(set)
     asked: dict[tuple[str, str], set[int]] = defaultdict(set)
     for key in keys:
-        own = known.get(key.policy) or known.get(f"{key.policy}/run-{key.run}")
+        parts = parts_of(key.policy, task=key.task, run=key.run)
+        own = next((known[part] for part in parts if known.get(part)), None)
         if own is None:
             continue
         place = (key.policy, key.task)

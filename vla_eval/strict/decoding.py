@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import math
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
 
 from vla_eval.errors import MAX_SHOWN, RecipeError, did_you_mean
@@ -18,6 +18,8 @@ from vla_eval.strict.bounds import MAX_DEPTH
 from vla_eval.strict.json_text import WORDS, shown, wrong
 from vla_eval.strict.renamed import current_names, use_current_names, warn_renamed
 from vla_eval.strict.yaml_data import load_yaml as load_yaml
+
+READ = "read"
 
 
 def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
@@ -31,6 +33,11 @@ def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
     except RecipeError as exc:
         raise RecipeError(f"{where}: {exc}") from exc
     return decoded
+
+
+def read_by(read: Callable[[Any], Any]) -> dict[str, Any]:  # Any: plain data, not yet checked
+    """Return the metadata of a dataclass field that may be written in another way; `read` rewrites it."""
+    return {READ: read}
 
 
 def check_value(hint: Any, value: object, *, path: str) -> Any:  # Any: a type annotation, and such a value
@@ -136,6 +143,9 @@ def _decoded_fields(cls: type, data: Mapping[str, Any], *, path: str) -> Any:  #
     data = dict(data)
     use_current_names(cls, data, prefix=prefix)
     fields = [field for field in dataclasses.fields(cls) if field.init]
+    for field in fields:
+        if READ in field.metadata and field.name in data:
+            data[field.name] = field.metadata[READ](data[field.name])
     for name in data:
         if name not in hints:
             raise RecipeError(_no_such_field(f"{prefix}{name}", name, [field.name for field in fields]))
