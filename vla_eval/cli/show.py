@@ -1,20 +1,23 @@
-"""`mikasa-vla show NAME`: a task (what it asks for, how it is scored, its arguments), or a recipe's fields.
+"""`mikasa-vla show NAME`: a task (goal, scoring, arguments), a recipe's fields, or what a folder is.
 
 The task's source is read, not imported: importing it would start a simulator.
 """
 
 import argparse
+import os
 import textwrap
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from vla_eval.cli.terminal.screen import filled
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import Folder, list_recipes, load_recipe
+from vla_eval.config.files import Folder, list_recipes, load_recipe, recipe_fields
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.config.protocol import Protocol
-from vla_eval.errors import unknown_name
+from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, some_of, unknown_name
 from vla_eval.evaluation.model_table import ModelTable, is_model_table
 from vla_eval.tasks.catalog import FAMILIES, TASKS, find_task, installed_tasks, task_spec
 from vla_eval.tasks.source import TaskArgument, task_arguments
@@ -51,10 +54,10 @@ KINDS: dict[Folder, _Kind] = {
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
     """Declare the arguments."""
     parser = subparsers.add_parser(
-        "show", help="explain one task, policy, configuration, dataset or protocol", allow_abbrev=False
+        "show", help="explain a task, policy, configuration, dataset, protocol or folder", allow_abbrev=False
     )
     parser.add_argument(
-        "name", metavar="NAME", help="task id, or name or file of a recipe (`mikasa-vla list`)"
+        "name", metavar="NAME", help="task id, name or file of a recipe (`mikasa-vla list`), or a folder"
     )
     parser.add_argument(
         "--prompt-set", default=DEFAULT_PROMPT_SET, metavar="NAME", help="which instructions (paper)"
@@ -66,10 +69,11 @@ def run(args: argparse.Namespace) -> int:
 
     Raises:
         UnknownNameError: there is nothing of this name; the message suggests the closest one of all kinds.
+        RunFolderError: it is a folder, but neither of a run, a training, a dataset nor a checkpoint.
         RecipeError: it is a recipe that cannot be read.
     """
     if find_task(args.name) is None:
-        return _show_recipes(args.name)
+        return _show_folder(Path(args.name)) if os.path.isdir(args.name) else _show_recipes(args.name)
     spec = task_spec(args.name)
     if spec.is_official:
         return _show_official(spec, args.prompt_set)
@@ -95,22 +99,57 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
+def _show_folder(folder: Path) -> int:
+    # Here and not above: tasks and recipes need not wait for what reads datasets.
+    from vla_eval.cli.shared.folders import folder_lines
+
+    for label, text in folder_lines(folder):
+        _print_whole(label, text)
+    return 0
+
+
 def _show_recipes(name: str) -> int:
-    """Print the recipes of a name, of whatever kind; a file is one of the kind that its folder says."""
+    """Print the recipes of a name; a file is what its folder is called, or what its fields are of."""
     stem = Path(name.removesuffix(".yaml")).name
     folder = Path(name).parent.name
+    if os.path.isfile(name):
+        of_folder = [kind for kind in KINDS if kind == folder]
+        _show_recipe(of_folder[0] if of_folder else _kind_of_file(name), name)
+        return 0
     kinds = [kind for kind in KINDS if folder in ("", kind)]
     found = [kind for kind in kinds if stem in list_recipes(kind)]
+    if not found and os.sep in name and not kinds:
+        raise UnknownNameError(
+            f"{name:.{MAX_SHOWN}}: there is no such file or folder in {Path.cwd()}. Expected one, or a name "
+            "of `mikasa-vla list`."
+        )
     if not found:
         known = [one for kind in KINDS for one in list_recipes(kind)]
         raise unknown_name(
-            "task, policy, configuration, dataset or protocol",
+            "task, policy, configuration, dataset, protocol or folder",
             name,
             {*TASKS, *FAMILIES, *installed_tasks(), *known},
         )
     for kind in found:
         _show_recipe(kind, stem if folder in ("", kind) else name)
     return 0
+
+
+def _kind_of_file(name: str) -> Folder:
+    """Return which kind of recipe has all the fields of a file.
+
+    Raises:
+        RecipeError: none has.
+    """
+    given = recipe_fields("configs", name)
+    for folder, kind in KINDS.items():
+        for cls in (kind.recipe, *((ModelTable,) if folder == "configs" else ())):
+            if given <= {field.name for field in fields(cls)}:
+                return folder
+    raise RecipeError(
+        f"{name}: no kind of recipe has all of its fields ({some_of(sorted(given))}). Put it into a folder "
+        f"of the name of its kind ({', '.join(KINDS)}) to see which one is wrong."
+    )
 
 
 def _show_recipe(folder: Folder, name: str) -> None:
@@ -122,7 +161,8 @@ def _show_recipe(folder: Folder, name: str) -> None:
         next_step = "mikasa-vla finetune --policy {name} --dataset DIR"
     elif cls is ModelTable:
         next_step = "mikasa-vla finetune {name}, then mikasa-vla eval {name}"
-    _print(kind.word, f"{recipe.name} ({recipe.path})")
+    _print(kind.word, recipe.name)
+    _print_whole("file", str(recipe.path))
     _print("about", recipe.value.description)
     _print("next", next_step.format(name=recipe.name))
     print(f"fields\n{textwrap.indent(recipe.path.read_text(encoding='utf-8').rstrip(), '  ')}")
@@ -146,8 +186,13 @@ def _show_official(spec: TaskSpec, prompt_set: str) -> int:
     return 0
 
 
+def _print_whole(label: str, text: str) -> None:
+    """Print a path or a command on one line, so that it can be copied."""
+    print(f"{label:{INDENT}}{text}")
+
+
 def _print(label: str, text: str) -> None:
-    print(textwrap.fill(text, WIDTH, initial_indent=f"{label:{INDENT}}", subsequent_indent=" " * INDENT))
+    print(filled(text, WIDTH, first=f"{label:{INDENT}}", rest=" " * INDENT))
 
 
 def _chance(spec: TaskSpec) -> str:

@@ -1,0 +1,113 @@
+"""What a folder that a user names is: a run, training, dataset or checkpoint; and what to do with it."""
+
+import os
+import shlex
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from vla_eval.checkpoints.files import CONFIG_FILE, find_checkpoint, weights_file
+from vla_eval.checkpoints.files import read_facts as read_training_facts
+from vla_eval.data.facts import find_facts
+from vla_eval.data.info_file import INFO_FILE, read_info
+from vla_eval.errors import RunFolderError, some_of
+from vla_eval.storage.run_file import RUN_FILE
+from vla_eval.storage.run_folder import read_run
+from vla_eval.training.run_folder import RUN_FILE as TRAINING_FILE
+from vla_eval.training.run_folder import newest_step, read_record
+
+type Lines = Iterator[tuple[str, str]]  # label, text
+
+
+class _Kind(NamedTuple):
+    """A kind of folder: a file that shows it, what it holds, and the next commands."""
+
+    word: str
+    is_it: Callable[[Path], bool]
+    lines: Callable[[Path], Lines]
+    next_steps: tuple[str, ...]
+
+
+def folder_lines(folder: Path) -> Lines:
+    """Yield label and text of each line that describes a folder.
+
+    Raises:
+        RunFolderError: it is none of these kinds.
+        VlaEvalError: its files cannot be read.
+    """
+    for kind in KINDS:
+        if kind.is_it(folder):
+            yield kind.word, str(folder)
+            yield from kind.lines(folder)
+            for index, step in enumerate(kind.next_steps):
+                yield "" if index else "next", step.format(folder=shlex.quote(str(folder)))
+            return
+    found = some_of(sorted(os.listdir(folder))) or "nothing"
+    raise RunFolderError(
+        f"{folder}: expected a run ({RUN_FILE}), a training ({TRAINING_FILE}), a dataset ({INFO_FILE}) or a "
+        f"checkpoint ({CONFIG_FILE} and weights); found {found}."
+    )
+
+
+def _of_run(folder: Path) -> Lines:
+    run = read_run(folder)
+    outcomes = Counter(record.outcome for record in run.records)
+    yield "command", run.description.command
+    yield "tasks", some_of(sorted({record.key.task for record in run.records})) or "no episode yet"
+    yield "policies", some_of(sorted({record.key.policy for record in run.records})) or "no episode yet"
+    yield "episodes", ", ".join(f"{outcomes[name]} {name}" for name in sorted(outcomes)) or "none yet"
+
+
+def _of_training(folder: Path) -> Lines:
+    record = read_record(folder)
+    yield "policy", str(record.get("policy"))
+    yield "command", str(record.get("command"))
+    yield "step", f"{newest_step(folder)}, the newest checkpoint's"
+
+
+def _of_dataset(folder: Path) -> Lines:
+    info, facts = read_info(folder), find_facts(folder)
+    yield "about", facts.kind if facts is not None else "a LeRobotDataset of another program"
+    yield "episodes", f"{info['total_episodes']}, {info['total_frames']} frames, {info['fps']:g} a second"
+    if facts is not None:
+        yield "tasks", some_of(facts.tasks)
+        yield "actions", facts.control_mode
+    yield "features", ", ".join(info["features"])
+
+
+def _of_checkpoint(folder: Path) -> Lines:
+    found = find_checkpoint(folder)
+    facts = read_training_facts(found)
+    weights = weights_file(found)
+    if weights is not None:
+        yield "weights", f"{weights} ({weights.stat().st_size / 1e6:.1f} MB)"
+    if facts is None:
+        yield "trained on", "not noted: trained by another program"
+    else:
+        yield "trained on", f"{facts.dataset} ({some_of(facts.tasks) or facts.task or 'no task noted'})"
+        yield "actions", facts.control_mode
+
+
+EVALUATE = "mikasa-vla eval --task TASK --policy {folder} cue_blind oracle random"
+KINDS = (
+    _Kind(
+        "run",
+        lambda folder: (folder / RUN_FILE).is_file(),
+        _of_run,
+        ("mikasa-vla report {folder}", "mikasa-vla report {folder} --html PAGE", "mikasa-vla view {folder}"),
+    ),
+    _Kind("training", lambda folder: (folder / TRAINING_FILE).is_file(), _of_training, (EVALUATE,)),
+    _Kind(
+        "dataset",
+        lambda folder: (folder / INFO_FILE).is_file(),
+        _of_dataset,
+        ("mikasa-vla dataset check {folder}", "mikasa-vla finetune --policy RECIPE --dataset {folder}"),
+    ),
+    _Kind(
+        "checkpoint",
+        lambda folder: (folder / CONFIG_FILE).is_file(),
+        _of_checkpoint,
+        ("mikasa-vla checkpoint verify {folder}", EVALUATE),
+    ),
+)
