@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import shutil
+import socket
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -27,9 +28,11 @@ from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.cli.main import main
 from vla_eval.config.files import list_recipes
 from vla_eval.config.policy import load_policy
-from vla_eval.errors import CheckpointError, UnknownNameError
+from vla_eval.errors import CheckpointError, LockedError, RecipeError, UnknownNameError
+from vla_eval.lock.switch import locked
 from vla_eval.models.families import bases
 from vla_eval.models.family import Base, Source
+from vla_eval.policies.entries import load_policy_entries
 from vla_eval.testing.tiny_models import tiny_paligemma
 
 WEIGHTS_FILE = "model.safetensors"
@@ -274,3 +277,74 @@ def test_a_recipe_that_starts_from_another_training_says_which_command_trains_it
     # The weights of the one fit the network of the other.
     for name in ("core", "core_options", "encoder", "erase_warmup_episodes"):
         assert then.policy[name] == first.policy[name], name
+
+
+class TestHubIds:
+    ID = f"hub:somebody/pi0@{COMMIT}"
+    FOLDER = Path(f"checkpoints/somebody--pi0@{COMMIT}")
+    EVAL = ("eval", "--task", "RememberColor3-v0", "--episodes", "1", "--set", "simulator=fake")
+
+    @pytest.fixture
+    def whole(self, hub: Hub, pi0: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Hub:  # noqa: F811
+        """Serve a whole LeRobot checkpoint where the Hub's client looks for the Hub."""
+        shutil.copytree(pi0 / "tokenizer", hub.repositories["somebody/pi0"] / "tokenizer")
+        monkeypatch.setattr(fetching, "HfApi", lambda: HfApi(endpoint=hub.endpoint, token=False))
+        monkeypatch.chdir(tmp_path)
+        return hub
+
+    def test_a_policy_that_is_named_so_is_fetched_once_and_read_as_a_folder(self, whole: Hub) -> None:
+        with tiny_paligemma("pi0"):
+            (entry,) = load_policy_entries([f"mine={self.ID}"])
+        asked = len(whole.requests)
+        (again,) = load_policy_entries([f"mine={self.ID}"])
+
+        assert entry == again and len(whole.requests) == asked
+        assert entry.value.args == {"checkpoint": str(self.FOLDER)}
+        assert entry.recipes[0].sha256 == checkpoint_sha256(self.FOLDER) == checkpoint_sha256(Path(self.ID))
+        assert not (self.FOLDER / "run_me.py").exists()  # code is not fetched
+        assert json.loads((self.FOLDER / BASE_FILE).read_text())["parts"][0]["commit"] == COMMIT
+
+    def test_a_dry_run_fetches_nothing_and_names_the_command(
+        self, whole: Hub, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main([*self.EVAL, "--policy", f"mine={self.ID}", "--dry-run"]) == 1
+        assert f"mikasa-vla checkpoint fetch {self.ID}" in capsys.readouterr().err
+        assert whole.requests == []
+
+    def test_without_a_network_it_says_what_to_do(
+        self, whole: Hub, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        monkeypatch.setattr(huggingface_hub.constants, "HF_HUB_OFFLINE", True)
+        assert main([*self.EVAL, "--policy", self.ID]) == 1
+        said = capsys.readouterr().err
+        assert "HF_HUB_OFFLINE" in said and "Unset it" in said
+        assert f"hf download somebody/pi0 --revision {COMMIT}" in said
+        assert f"--local-dir {self.FOLDER}" in said
+
+    def test_a_base_of_recipes_comes_with_its_tokenizer_and_its_pinned_commit(self) -> None:
+        known = bases()["smolvla_base"]
+        assert find_base("hub:lerobot/smolvla_base").parts == known.parts
+        other = find_base("hub:lerobot/smolvla_base@main")
+        assert (other.name, other.weights.revision) == ("lerobot--smolvla_base@main", "main")
+        assert other.parts[:-1] == known.parts[:-1]
+
+    @pytest.mark.parametrize(
+        ("name", "message"),
+        [
+            ("hub:smolvla_base", r"expected hub:OWNER/NAME or hub:OWNER/NAME@REVISION"),
+            ("hub:../../etc", r"expected hub:OWNER/NAME"),
+            ("hub:a/b@../c", r"expected hub:OWNER/NAME"),
+            ("hub:openvla/openvla-7b", r"expected a LeRobot checkpoint.*checkpoint fetch openvla_7b"),
+        ],
+    )
+    def test_what_cannot_be_fetched_so_is_refused_before_anything_is_asked(
+        self, name: str, message: str
+    ) -> None:
+        with pytest.raises((RecipeError, CheckpointError), match=message):
+            load_policy_entries([name])
+
+    def test_the_network_is_closed_again_afterwards(self, whole: Hub) -> None:
+        with locked(), tiny_paligemma("pi0"):
+            load_policy_entries([self.ID])
+            with pytest.raises(LockedError):
+                socket.create_connection(("127.0.0.1", int(whole.endpoint.rpartition(":")[2])))

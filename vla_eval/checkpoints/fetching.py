@@ -7,6 +7,7 @@ whether they fit on the disk. After an interruption the same call resumes.
 import contextlib
 import dataclasses
 import json
+import os
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -17,13 +18,13 @@ from unittest.mock import patch
 import httpx
 import huggingface_hub.constants
 from huggingface_hub import HfApi, hf_hub_url
-from huggingface_hub.errors import GatedRepoError, HFValidationError
+from huggingface_hub.errors import GatedRepoError, HFValidationError, OfflineModeIsEnabled
 from huggingface_hub.file_download import http_get
 from huggingface_hub.utils import build_hf_headers, filter_repo_objects  # type: ignore[attr-defined]
 
 from vla_eval.checkpoints.files import BASE_FILE, file_sha256, find_checkpoint
 from vla_eval.errors import CheckpointError, some_of
-from vla_eval.lock.switch import let_connect, let_write
+from vla_eval.lock.switch import connecting, let_write
 from vla_eval.models.family import Base, Source
 
 DOWNLOADS = ".downloads"
@@ -70,21 +71,21 @@ def fetch_base(
         return out
     api = api or HfApi()
     downloads = out.parent / DOWNLOADS / out.name
-    let_connect("checkpoint fetch")
-    let_write(downloads)
+    let_write(out, downloads)
     sources = [
         *base.parts[:-1],
         dataclasses.replace(base.weights, revision=revision or base.weights.revision),
     ]
-    parts = [_settle(api, base, source, out) for source in sources]
-    _check_disk(base, parts, downloads, say)
-    for part in parts:
-        folder = downloads / part.source.folder
-        say(f"{part.source.repo_id}: {len(part.files)} files, {part.n_bytes / GB:.2f} GB, to {folder}")
-        with _hub_errors(base, part.source, out):
-            for name, remote in part.files.items():
-                _download(api, part, remote.n_bytes, name, folder / name)
-        _check_files(part, folder)
+    with connecting("checkpoint fetch"):
+        parts = [_settle(api, base, source, out) for source in sources]
+        _check_disk(base, parts, downloads, say)
+        for part in parts:
+            folder = downloads / part.source.folder
+            say(f"{part.source.repo_id}: {len(part.files)} files, {part.n_bytes / GB:.2f} GB, to {folder}")
+            with _hub_errors(base, part.source, out):
+                for name, remote in part.files.items():
+                    _download(api, part, remote.n_bytes, name, folder / name)
+            _check_files(part, folder)
     made = _publish(base, parts, downloads, out)
     say(f"{made}: {_check(base, made)}")
     return made
@@ -234,6 +235,11 @@ def _hub_errors(base: Base, source: Source, out: Path) -> Iterator[None]:
         raise CheckpointError(
             f"{source.repo_id}: its authors ask that you accept their terms ({base.terms}). Open the model's "
             "page on the Hub, accept them, log in with `hf auth login`, and run the same command again."
+        ) from exc
+    except OfflineModeIsEnabled as exc:
+        raise CheckpointError(
+            f"{base.name} cannot be fetched: HF_HUB_OFFLINE={os.environ.get('HF_HUB_OFFLINE', '')} forbids "
+            f"connections to the Hub. Unset it, or set it to 0 for this command. {by_hand(base, out)}"
         ) from exc
     except (OSError, httpx.HTTPError, HFValidationError) as exc:
         reason = next((line for line in str(exc).splitlines() if line.strip()), type(exc).__name__)

@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.checkpoints.bases import how_to_get
+from vla_eval.checkpoints.bases import how_to_get, hub_folder
 from vla_eval.config.shipped import search_folders
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
 from vla_eval.lock.switch import distrust
@@ -78,7 +78,11 @@ class TrainingFacts:
 
 
 def find_checkpoint(path: Path) -> Path:
-    """Return the folder with the weights, of a checkpoint, a run, or a name in a folder `checkpoints/`."""
+    """Return the folder with the weights, of a checkpoint, a run, or a name in a folder `checkpoints/`.
+
+    Of a Hub id, `hub:OWNER/NAME`, it is the folder that it was fetched to.
+    """
+    asked, path = path, hub_folder(str(path)) or path
     places = [path]
     if path.name == str(path):
         places += [folder / path for folder in search_folders(SHIPPED_FOLDER)]
@@ -92,10 +96,10 @@ def find_checkpoint(path: Path) -> Path:
     else:
         names = sorted(entry.name for entry in path.iterdir())
         found = ", ".join(names[:8]) or "an empty folder"
-    command = how_to_get(path)
+    command = how_to_get(asked)
     hint = command or did_you_mean(str(path), list_checkpoints())
     raise CheckpointError(
-        f"{path!s:.300}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder "
+        f"{asked!s:.300}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder "
         f"that holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) "
         f"are never loaded: convert them to safetensors.{hint}"
     )

@@ -68,8 +68,9 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     add_flags(
         parser,
         task="task ids (`mikasa-vla list tasks`)",
-        policy="names in policies/, files, folders of checkpoints, or ws://HOST:PORT of a policy server; "
-        "NAME=DIR,DIR,DIR: one row whose runs are these checkpoints; NAME:TASK=DIR, several: one per task",
+        policy="names in policies/, files, folders or hub:OWNER/NAME@REVISION of checkpoints, or "
+        "ws://HOST:PORT of a policy server; NAME=DIR,DIR,DIR: one row whose runs are these checkpoints; "
+        "NAME:TASK=DIR, several: one per task",
         n_action_steps="actions executed per inference; several: one after another",
         episodes="episodes per task, policy and run (100)",
     )
@@ -140,7 +141,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.cli.terminal.progress import stop_on_signals
     from vla_eval.evaluation.needed_files import needed_files
     from vla_eval.evaluation.resolve import RUNS_FOLDER, ResolvedEvaluation
-    from vla_eval.policies.entries import load_policy_entries
+    from vla_eval.policies.entries import load_policy_entries, refuse_unfetched
     from vla_eval.storage.run_folder import read_run
 
     if args.config is not None and is_model_table(args.config):
@@ -151,6 +152,8 @@ def run(args: argparse.Namespace) -> int:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)
     check_table_arguments(args)
+    if args.dry_run:
+        refuse_unfetched(config.policies)
     policies = load_policy_entries(config.policies)
     check_baseline(args.baseline, [policy.name for policy in policies])
 

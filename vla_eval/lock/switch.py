@@ -82,6 +82,17 @@ def let_connect(why: str, *programs: str) -> None:
     STATE.tools |= frozenset(filter(None, map(shutil.which, programs)))
 
 
+@contextlib.contextmanager
+def connecting(why: str) -> Iterator[None]:
+    """Let this process connect to anything while the context is open."""
+    before = STATE.network
+    let_connect(why)
+    try:
+        yield
+    finally:
+        STATE.network = before
+
+
 def let_everything(why: str) -> None:
     """Let this process start programs, connect, write and import: it runs code of the user's own."""
     if STATE.is_on and STATE.everything is None:

@@ -6,7 +6,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+from vla_eval.checkpoints.bases import hub_folder
+from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.config.files import Recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError
@@ -75,6 +78,15 @@ def load_policy_entry(text: str) -> PolicyEntry:
     _check_alike(text, named.checkpoints, recipes)
     task = None if named.task is None else task_spec(with_version(named.task)).id
     return PolicyEntry(name=named.name, recipes=recipes, texts=named.checkpoints, is_by_run=True, task=task)
+
+
+def refuse_unfetched(texts: Sequence[str]) -> None:
+    """Raise `CheckpointError` for a Hub id that is not here yet: reading the policies would fetch it."""
+    for text in texts:
+        named = named_checkpoints(text)
+        for one in (text,) if named is None else named.checkpoints:
+            if hub_folder(one) is not None:
+                find_checkpoint(Path(one))
 
 
 def _single(text: str) -> PolicyEntry:

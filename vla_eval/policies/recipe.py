@@ -1,12 +1,14 @@
-"""A policy by its name: a recipe in `policies/`, a folder that holds a LeRobot checkpoint, or an address.
+"""A policy by its name: a recipe in `policies/`, a folder or Hub id of a LeRobot checkpoint, or an address.
 
 Knows nothing of models: a folder is looked at, never loaded; a server is asked what it is.
 """
 
+import logging
 import os
 from dataclasses import replace
 from pathlib import Path
 
+from vla_eval.checkpoints.bases import find_base, hub_folder
 from vla_eval.checkpoints.config_check import MAX_ACTIONS
 from vla_eval.checkpoints.files import (
     CONFIG_FILE,
@@ -24,6 +26,8 @@ from vla_eval.policies.remote.survey import moved, survey_address
 from vla_eval.strict.json_fields import get_count, get_text
 from vla_eval.wire.addresses import named_server
 
+logger = logging.getLogger(__name__)
+
 BIG_CHECKPOINT_BYTES = 1 << 30  # of such policies one worker is enough for a GPU, and too much for most CPUs
 
 
@@ -38,12 +42,13 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
 
     Args:
         name: the name of a recipe, its file, or a folder: a fine-tuning run, a checkpoint in it, or a
-            LeRobot checkpoint. The recipe's digest is then that of the checkpoint's files. Or the address of
-            a policy server, `ws://HOST:PORT`, with commas if there are several, maybe after `RECIPE@`.
+            LeRobot checkpoint; or `hub:OWNER/NAME@REVISION`, which is fetched if it is not there. The
+            recipe's digest is then that of the checkpoint's files. Or the address of a policy server,
+            `ws://HOST:PORT`, with commas if there are several, maybe after `RECIPE@`.
 
     Raises:
         UnknownNameError, RecipeError: see `load_recipe`.
-        CheckpointError: it is a folder without a checkpoint.
+        CheckpointError: it is a folder without a checkpoint, or the Hub does not give it.
         RemotePolicyError: it is an address, and there is no policy server.
     """
     server = named_server(name)
@@ -52,7 +57,13 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
     if server is not None:
         recipe = load_recipe("policies", bare_policy(name), PolicyRecipe)
         return replace(recipe, value=moved(recipe, server.urls))
-    if not is_folder(name):
+    fetched = hub_folder(name)
+    if fetched is not None and not fetched.is_dir():
+        # Here and not above: the Hub's client takes long to import.
+        from vla_eval.checkpoints.fetching import fetch_base
+
+        fetch_base(find_base(name), fetched, say=logger.warning)
+    elif fetched is None and not is_folder(name):
         return load_recipe("policies", name, PolicyRecipe)
     folder = find_checkpoint(Path(name))
     config = read_json(folder / CONFIG_FILE)

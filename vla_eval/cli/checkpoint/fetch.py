@@ -21,7 +21,9 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
         description=f"{DESCRIPTION}{', '.join(bases())}.",
         allow_abbrev=False,
     )
-    fetch.add_argument("name", metavar="NAME", help="of a base, or of a recipe that starts from it")
+    fetch.add_argument(
+        "name", metavar="NAME", help="of a base, of a recipe that starts from it, or hub:OWNER/NAME@REVISION"
+    )
     fetch.add_argument("--out", type=Path, metavar="DIR", help="folder to make (checkpoints/NAME)")
     fetch.add_argument("--revision", metavar="REV", help="branch, tag or commit (the pinned one)")
 
@@ -29,11 +31,11 @@ def add_parsers(actions: "argparse._SubParsersAction[Any]") -> None:  # Any: the
 def run(args: argparse.Namespace) -> list[str]:
     """Do it; return lines for standard output."""
     # Here and not above: `mikasa-vla --help` need not wait for the Hub's client.
-    from vla_eval.checkpoints.bases import find_base
+    from vla_eval.checkpoints.bases import FOLDER, find_base
     from vla_eval.checkpoints.fetching import fetch_base
 
     base = find_base(args.name)
-    out = args.out or Path("checkpoints") / base.name
+    out = args.out or FOLDER / base.name
 
     def say(line: str) -> None:
         print(line, file=sys.stderr, flush=True)
