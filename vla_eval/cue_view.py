@@ -49,15 +49,10 @@ class CueLocator(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CueViewSettings:
-    """What a policy sees of the cue.
+    """What a policy sees of the cue."""
 
-    Attributes:
-        kind: see `CueViewKind`.
-        begins_at: the step of the cue's first frame; earlier frames are never changed.
-    """
-
-    kind: CueViewKind = "as_shown"
-    begins_at: int = 0
+    kind: CueViewKind = "as_shown"  # see `CueViewKind`
+    begins_at: int = 0  # the step of the cue's first frame; earlier frames are never changed
 
     @property
     def hides(self) -> bool:

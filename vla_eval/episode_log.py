@@ -28,27 +28,18 @@ TCP_POSE = "tcp_pose"  # the state whose first three numbers are the tool centre
 
 @dataclass(slots=True, kw_only=True)
 class EpisodeLog:
-    """Counts and digest of one episode.
+    """Counts and digest of one episode."""
 
-    Attributes:
-        start: the episode.
-        status: what the task said last.
-        n_steps: control steps executed.
-        last_inference_step: of the policy; -1 before the first one.
-        success_step: control steps executed when the success rule first held.
-        tcp_start_m: where the tool centre point began; None if its pose is not a state of the environment.
-        tcp_reach_m: how far it ever was from there.
-    """
-
-    start: EpisodeStart
-    status: TaskStatus
+    start: EpisodeStart  # the episode
+    status: TaskStatus  # what the task said last
+    # where the tool centre point began; None if its pose is not a state of the environment
     tcp_start_m: NDArray[np.float64] | None
-    tcp_reach_m: float | None = None
-    n_steps: int = 0
-    success_step: int | None = None
+    tcp_reach_m: float | None = None  # how far it ever was from there
+    n_steps: int = 0  # control steps executed
+    success_step: int | None = None  # control steps executed when the success rule first held
     episode_return: float = 0.0
     n_inferences: int = 0
-    last_inference_step: int = -1
+    last_inference_step: int = -1  # of the policy; -1 before the first one
     n_frames: int = 0
     n_clipped_steps: int = 0
     digest: "hashlib._Hash" = field(default_factory=hashlib.sha256)

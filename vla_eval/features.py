@@ -51,19 +51,13 @@ STATE_NAMES: dict[StateKind, tuple[str, ...]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EncoderSettings:
-    """How frames become video. Defaults keep colours: no chroma subsampling, about 40 dB.
+    """How frames become video. Defaults keep colours: no chroma subsampling, about 40 dB."""
 
-    Attributes:
-        vcodec: codec as lerobot names it.
-        pix_fmt: `yuv444p` keeps the colour of every pixel; `yuv420p` caps quality at about 34 dB.
-        crf: quality; lower is better and larger.
-        g: a key frame every so many frames; small, since training reads frames at random.
-    """
-
-    vcodec: str = "h264"
+    vcodec: str = "h264"  # codec as lerobot names it
+    # `yuv444p` keeps the colour of every pixel; `yuv420p` caps quality at about 34 dB
     pix_fmt: str = "yuv444p"
-    crf: Annotated[int, Bounds(0, MAX_CRF)] = 12
-    g: Steps = 2
+    crf: Annotated[int, Bounds(0, MAX_CRF)] = 12  # quality; lower is better and larger
+    g: Steps = 2  # a key frame every so many frames; small, since training reads frames at random
 
     def __post_init__(self) -> None:
         """Check the ranges; whether the codec knows the format is lerobot's to say."""

@@ -55,37 +55,27 @@ class TaskStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrivilegedState:
-    """The world as it truly is, for scripted controls. Never given to a learned policy.
+    """The world as it truly is, for scripted controls. Never given to a learned policy."""
 
-    Attributes:
-        phase: the phase that holds at this step.
-        response_step: the step at which the response phase begins (0 for a task without phases).
-        tcp_position_m: (3,) tool centre point, world frame.
-        tcp_velocity_m_s: (3,) its linear velocity, world frame.
-        gripper_width_m: gap between the fingers, 0 to 0.08.
-        candidate_positions_m: (N, 3) where each candidate is (or, before the response phase, will
-            be), world frame, in candidate order; (0, 3) for a task without candidates.
-        target: index of the right candidate; None for a task without candidates or with several right ones.
-        right_candidates: indices of all right candidates, in the order shown; empty without candidates.
-        shown_candidates: those of them whose cue is in view at this step.
-        in_order: whether several right candidates must be touched in that order.
-        touched_candidates: indices of those touched so far, in the order of first touch.
-        bodies: bodies and places by name, as the task names them: `ball`, `goal` …
-        tcp_yaw_rad: how far the gripper is turned about world z; 0 with the fingers in a row along y.
-    """
-
-    phase: Phase
-    response_step: int
-    tcp_position_m: NDArray[np.float64]
-    tcp_velocity_m_s: NDArray[np.float64]
-    gripper_width_m: float
+    phase: Phase  # the phase that holds at this step
+    response_step: int  # the step at which the response phase begins (0 for a task without phases)
+    tcp_position_m: NDArray[np.float64]  # (3,) tool centre point, world frame
+    tcp_velocity_m_s: NDArray[np.float64]  # (3,) its linear velocity, world frame
+    gripper_width_m: float  # gap between the fingers, 0 to 0.08
+    # (N, 3) where each candidate is (or, before the response phase, will be), world frame, in candidate
+    # order; (0, 3) for a task without candidates
     candidate_positions_m: NDArray[np.float64]
+    # index of the right candidate; None for a task without candidates or with several right ones
     target: int | None
+    # indices of all right candidates, in the order shown; empty without candidates
     right_candidates: tuple[int, ...] = ()
-    shown_candidates: tuple[int, ...] = ()
-    in_order: bool = False
+    shown_candidates: tuple[int, ...] = ()  # those of them whose cue is in view at this step
+    in_order: bool = False  # whether several right candidates must be touched in that order
+    # indices of those touched so far, in the order of first touch
     touched_candidates: tuple[int, ...] = ()
+    # bodies and places by name, as the task names them: `ball`, `goal` …
     bodies: Mapping[str, "BodyState"] = field(default_factory=dict)
+    # how far the gripper is turned about world z; 0 with the fingers in a row along y
     tcp_yaw_rad: float = 0.0
 
 

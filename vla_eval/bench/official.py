@@ -46,20 +46,13 @@ class Costs(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Baseline:
-    """One process that renders every step.
-
-    Attributes:
-        n_steps: control steps after its first episode.
-        seconds: for these.
-        cpu_seconds: for these; None: not measured.
-        start_seconds: until its first episode would have begun: the rest of the first one's time.
-    """
+    """One process that renders every step."""
 
     name: str
-    n_steps: int
-    seconds: float
-    cpu_seconds: float | None
-    start_seconds: float
+    n_steps: int  # control steps after its first episode
+    seconds: float  # for these
+    cpu_seconds: float | None  # for these; None: not measured
+    start_seconds: float  # until its first episode would have begun: the rest of the first one's time
 
     @property
     def per_second(self) -> float:
@@ -69,23 +62,16 @@ class Baseline:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationRow:
-    """One evaluation at one chunk length.
-
-    Attributes:
-        n_steps, n_frames: control steps and rendered observations of all episodes.
-        seconds: from the command to its end.
-        first_seconds: from the command to the first record.
-        cpu_seconds: of all its processes.
-        floor_seconds: steps and frames, spread evenly over the workers.
-    """
+    """One evaluation at one chunk length."""
 
     n_action_steps: int
+    # `n_steps`, `n_frames`: control steps and rendered observations of all episodes
     n_steps: int
     n_frames: int
-    seconds: float
-    first_seconds: float
-    cpu_seconds: float
-    floor_seconds: float
+    seconds: float  # from the command to its end
+    first_seconds: float  # from the command to the first record
+    cpu_seconds: float  # of all its processes
+    floor_seconds: float  # steps and frames, spread evenly over the workers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -47,15 +47,11 @@ class Percentiles(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionsRow:
-    """So many sessions of one server, against so many copies.
-
-    Attributes:
-        n_copies: processes with a copy each; no more than there are cores.
-    """
+    """So many sessions of one server, against so many copies."""
 
     n_sessions: int
     served: Load
-    n_copies: int
+    n_copies: int  # processes with a copy each; no more than there are cores
     copies: Load
 
 
@@ -70,25 +66,16 @@ class Rounding(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServingReport:
-    """What one run measured.
-
-    Attributes:
-        n_parameters: of the small transformer; None for a policy that was named.
-        device: name of the GPU; None: there is none.
-        load: processes that wanted a core before the first measurement, see `os.getloadavg`.
-        n_latencies: inferences of which latencies are percentiles.
-        direct: milliseconds of an inference in the process, of a policy that computes nothing.
-        served: the same behind a socket.
-    """
+    """What one run measured."""
 
     policy: str
-    n_parameters: int | None
+    n_parameters: int | None  # of the small transformer; None for a policy that was named
     n_cores: int
-    device: str | None
-    load: float
-    n_latencies: int
-    direct: Percentiles
-    served: Percentiles
+    device: str | None  # name of the GPU; None: there is none
+    load: float  # processes that wanted a core before the first measurement, see `os.getloadavg`
+    n_latencies: int  # inferences of which latencies are percentiles
+    direct: Percentiles  # milliseconds of an inference in the process, of a policy that computes nothing
+    served: Percentiles  # the same behind a socket
     rows: tuple[SessionsRow, ...]
     rounding: tuple[Rounding, ...]
 

@@ -144,16 +144,11 @@ def serving(policy: str, *, n_rows: int) -> Iterator[Server]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Load:
-    """What was measured of something that infers.
-
-    Attributes:
-        resident_bytes: memory of its processes.
-        device_bytes: memory of the GPU that they took; None: there is none.
-    """
+    """What was measured of something that infers."""
 
     per_second: float
-    resident_bytes: int
-    device_bytes: int | None
+    resident_bytes: int  # memory of its processes
+    device_bytes: int | None  # memory of the GPU that they took; None: there is none
 
 
 def measure_copies(policy: str, *, n_copies: int, seconds: float) -> Load:

@@ -20,17 +20,11 @@ DRAWS = "an inference's draws depend on task, seed, run and control step"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """How a field is answered.
+    """How a field is answered."""
 
-    Attributes:
-        translated: into what of ours; None: the field is ignored.
-        instead: of an ignored one: what holds, and how to get what it asks for.
-        off: its value that asks for nothing, which the policy is built with.
-    """
-
-    translated: str | None = None
-    instead: str = ""
-    off: bool | None = None
+    translated: str | None = None  # into what of ours; None: the field is ignored
+    instead: str = ""  # of an ignored one: what holds, and how to get what it asks for
+    off: bool | None = None  # its value that asks for nothing, which the policy is built with
 
 
 EXECUTION_FIELDS: Mapping[str, Answer] = MappingProxyType(

@@ -44,21 +44,13 @@ MIGRATE = "python -m lerobot.processor.migrate_policy_normalization"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SavedStep:
-    """One step.
+    """One step."""
 
-    Attributes:
-        registry_name: under which lerobot knows the step; None: `imported` names it.
-        imported: module and class.
-        config: arguments of its constructor, plain data.
-        state_file: of its tensors, inside the checkpoint; None: it has none.
-        where: file and position, for messages.
-    """
-
-    registry_name: str | None
-    imported: str | None
-    config: Mapping[str, Any]
-    state_file: Path | None
-    where: str
+    registry_name: str | None  # under which lerobot knows the step; None: `imported` names it
+    imported: str | None  # module and class
+    config: Mapping[str, Any]  # arguments of its constructor, plain data
+    state_file: Path | None  # of its tensors, inside the checkpoint; None: it has none
+    where: str  # file and position, for messages
 
     @property
     def name(self) -> str:

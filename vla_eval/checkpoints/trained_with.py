@@ -21,17 +21,12 @@ Sentences = Mapping[str, Sequence[str]]
 
 
 class Asked(NamedTuple):
-    """What an evaluation asks of a policy; None: not known yet, and not compared.
+    """What an evaluation asks of a policy; None: not known yet, and not compared."""
 
-    Attributes:
-        env: what the environment offers.
-        images: image fields in the policy's order -> (height_px, width_px).
-        state: which proprioception it is given.
-    """
-
-    env: EnvSpec
+    env: EnvSpec  # what the environment offers
+    # image fields in the policy's order -> (height_px, width_px)
     images: Mapping[str, tuple[int, int]] | None = None
-    state: StateKind | None = None
+    state: StateKind | None = None  # which proprioception it is given
 
 
 class Compared(NamedTuple):

@@ -23,17 +23,11 @@ NAMES_OF_VERB = {"eval": "configs", "show": "tasks", "check": "policies"}
 
 
 class Words(NamedTuple):
-    """What can follow.
+    """What can follow."""
 
-    Attributes:
-        flags: verb -> its long flags.
-        values: flag -> the names that may follow it.
-        names: verb -> the names that may follow it.
-    """
-
-    flags: Mapping[str, Sequence[str]]
-    values: Mapping[str, Sequence[str]]
-    names: Mapping[str, Sequence[str]]
+    flags: Mapping[str, Sequence[str]]  # verb -> its long flags
+    values: Mapping[str, Sequence[str]]  # flag -> the names that may follow it
+    names: Mapping[str, Sequence[str]]  # verb -> the names that may follow it
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's

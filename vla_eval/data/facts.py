@@ -30,16 +30,10 @@ MAX_NAME = 255  # bytes; what file systems take
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DatasetFacts:
-    """What a recorded dataset is, and how it came about; for the rest see `Facts`.
-
-    Attributes:
-        name, recipe: of the resolved recipe; `recipe_sha256` is the digest of what content depends on.
-        recipe_files: `policies/oracle` -> sha256 of the file; likewise prompts and weights.
-        environment: commit, versions and machine, see `provenance.collect_environment`.
-        device: the device that rendered, as the environment describes it.
-    """
+    """What a recorded dataset is, and how it came about; for the rest see `Facts`."""
 
     complete: bool
+    # `name`, `recipe`: of the resolved recipe; `recipe_sha256` is the digest of what content depends on
     name: str
     task: str
     task_version: Positive
@@ -50,9 +44,9 @@ class DatasetFacts:
     n_failed_seeds: Count
     recipe: dict[str, Any]
     recipe_sha256: str
-    recipe_files: dict[str, str]
-    environment: dict[str, Any]
-    device: dict[str, str]
+    recipe_files: dict[str, str]  # `policies/oracle` -> sha256 of the file; likewise prompts and weights
+    environment: dict[str, Any]  # commit, versions and machine, see `provenance.collect_environment`
+    device: dict[str, str]  # the device that rendered, as the environment describes it
     files: dict[str, FileDigest]
     is_checked: ClassVar[bool] = True
     kept: ClassVar[tuple[str, ...]] = ()
@@ -76,19 +70,13 @@ class DatasetFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImportedEpisode:
-    """What the source of an import says about an episode.
+    """What the source of an import says about an episode."""
 
-    Attributes:
-        name: its file, or its number in the source.
-        source_seed: its seed in the source's environment; ours gives another episode for it.
-        success: whether the source's success flag holds at any frame; None if it has none.
-    """
-
-    name: str
+    name: str  # its file, or its number in the source
     n_steps: Positive
     instruction: str
-    source_seed: int | None
-    success: bool | None
+    source_seed: int | None  # its seed in the source's environment; ours gives another episode for it
+    success: bool | None  # whether the source's success flag holds at any frame; None if it has none
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -137,26 +125,20 @@ class ImportFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MixtureSource:
-    """A dataset of one task, whose episodes follow those of the sources before it.
-
-    Attributes:
-        task, task_version: None for an import that names none.
-        instructions: every sentence that occurs in it.
-        sha256: digest of the digests of all its files.
-        seeds: of its episodes, in their order; None for an import, whose seeds are not ours.
-        was_replayed: whether a replay had confirmed it when it was mixed.
-    """
+    """A dataset of one task, whose episodes follow those of the sources before it."""
 
     name: str
+    # `task`, `task_version`: None for an import that names none
     task: str | None
     task_version: Positive | None
-    instructions: tuple[str, ...]
+    instructions: tuple[str, ...]  # every sentence that occurs in it
     n_episodes: Positive
     n_frames: Positive
-    sha256: str
+    sha256: str  # digest of the digests of all its files
+    # of its episodes, in their order; None for an import, whose seeds are not ours
     seeds: tuple[Count, ...] | None
     failed_seeds: tuple[Count, ...]
-    was_replayed: bool
+    was_replayed: bool  # whether a replay had confirmed it when it was mixed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

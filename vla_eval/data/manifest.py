@@ -127,24 +127,18 @@ class FileDigest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayReport:
-    """What a replay found; `finetune` asks for `passed`.
-
-    Attributes:
-        n_episodes: episodes replayed; n_total: episodes of the dataset.
-        pixels: whether images were compared, too.
-        states_compared: `bit-equal`, or the tolerance where environments differ.
-        lowest_psnr_db: camera -> how close the video comes to the rendered frames in the worst episode;
-            empty where images were not compared.
-        manifest_sha256: digest of the manifest that was replayed; another manifest needs another replay.
-    """
+    """What a replay found; `finetune` asks for `passed`."""
 
     passed: bool
-    n_episodes: Count
+    n_episodes: Count  # episodes replayed; n_total: episodes of the dataset
     n_total: Count
-    pixels: bool
-    states_compared: str
+    pixels: bool  # whether images were compared, too
+    states_compared: str  # `bit-equal`, or the tolerance where environments differ
     mismatches: tuple[str, ...]
+    # camera -> how close the video comes to the rendered frames in the worst episode; empty where images
+    # were not compared
     lowest_psnr_db: dict[str, float]
+    # digest of the manifest that was replayed; another manifest needs another replay
     manifest_sha256: str
     environment: dict[str, Any] = field(default_factory=dict)  # Any: plain data
 

@@ -18,16 +18,11 @@ SET_UP = "Run `make setup` in the repository."
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """What a check found.
+    """What a check found."""
 
-    Attributes:
-        status: `fail` means that evaluations do not work; `warn`, that something may not.
-        advice: what to do, unless all is well.
-    """
-
-    status: Status
+    status: Status  # `fail` means that evaluations do not work; `warn`, that something may not
     found: str
-    advice: str = ""
+    advice: str = ""  # what to do, unless all is well
 
 
 class ProbeFailure(Exception):

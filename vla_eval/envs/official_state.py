@@ -48,15 +48,10 @@ _MUGS = ("mug_left", "mug_center", "mug_right")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Candidates:
-    """The objects among which one has to be chosen.
+    """The objects among which one has to be chosen."""
 
-    Attributes:
-        positions_m: (N, 3) where each is or, before the choice, will be; world frame.
-        target: index of the right one.
-    """
-
-    positions_m: Vector
-    target: int
+    positions_m: Vector  # (N, 3) where each is or, before the choice, will be; world frame
+    target: int  # index of the right one
 
 
 def read_candidates(row: TaskSpec, env: Any, *, revealed: bool) -> Candidates | None:

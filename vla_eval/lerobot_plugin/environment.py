@@ -160,25 +160,19 @@ def _features_map() -> dict[str, str]:
 class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
     """`--env.type=mikasa`; draccus reads it, hence no frozen dataclass.
 
-    Attributes:
-        task: task id, or several with commas between them.
-        state: which proprioception `observation.state` is: `eef` (10) or `joints` (25).
-        prompt_set: name in `prompts/`.
-        seed_offset: added to lerobot's seeds, which otherwise begin with its `--seed`.
-        env_kwargs: arguments of the task, `horizon_steps`, `control_mode` and `image_size` among them.
-        simulator, sim_backend, wrist_mesh, render_backend: see `EvalConfig`.
-
     Raises:
         RecipeError: several tasks at once in threads, which would share one policy and its queue of actions.
         UnknownNameError: there is no such task or kind of state.
     """
 
-    task: str | None = "RememberColor3-v0"
+    task: str | None = "RememberColor3-v0"  # task id, or several with commas between them
     fps: int = FPS
-    state: str = "eef"
-    prompt_set: str = "paper"
-    seed_offset: int = 0
+    state: str = "eef"  # which proprioception `observation.state` is: `eef` (10) or `joints` (25)
+    prompt_set: str = "paper"  # name in `prompts/`
+    seed_offset: int = 0  # added to lerobot's seeds, which otherwise begin with its `--seed`
+    # arguments of the task, `horizon_steps`, `control_mode` and `image_size` among them
     env_kwargs: dict[str, Any] = field(default_factory=dict)
+    # `simulator`, `sim_backend`, `wrist_mesh`, `render_backend`: see `EvalConfig`
     simulator: str = "maniskill"
     sim_backend: str = "cpu"
     wrist_mesh: str = "shipped"

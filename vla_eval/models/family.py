@@ -12,19 +12,12 @@ horizon of a diffusion policy whose scheduler draws nothing further."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """Files of a repository of the Hub.
+    """Files of a repository of the Hub."""
 
-    Attributes:
-        repo_id: `OWNER/NAME`.
-        revision: the commit that is fetched; None: the newest, which is noted beside the files.
-        patterns: names of the files, as shells match them.
-        folder: where they lie below the folder that is fetched; empty: in it.
-    """
-
-    repo_id: str
-    revision: str | None
-    patterns: tuple[str, ...]
-    folder: str = ""
+    repo_id: str  # `OWNER/NAME`
+    revision: str | None  # the commit that is fetched; None: the newest, which is noted beside the files
+    patterns: tuple[str, ...]  # names of the files, as shells match them
+    folder: str = ""  # where they lie below the folder that is fetched; empty: in it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,59 +67,42 @@ class Tiny:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Family:
-    """A type of LeRobot policy. What is named as `module:attribute` is imported when it is used.
+    """A type of LeRobot policy. What is named as `module:attribute` is imported when it is used."""
 
-    Attributes:
-        type: lerobot's name of it.
-        configuration: the module that registers it; empty: lerobot does.
-        wraps: lerobot's type to which ours adds something; the row is then a copy of that one's.
-        docs: page that explains it.
-        is_built_empty: its constructor does not compute with its weights: it is built without memory for
-            them.
-        replaces: `module:name` in lerobot -> `module:attribute` that stands there while a policy is loaded,
-            where lerobot would run code that comes with a checkpoint.
-        draws_nothing: it draws nothing at inference.
-        queues: what `reset` empties, of a type whose `predict_action_chunk` reads the frames that its own
-            `select_action` collected. It is asked for one action at a time (`checkpoints.select_step`).
-        why_not: why it can be asked neither for a chunk nor for a step of one of several episodes.
-        cuts_chunk: its `predict_action_chunk` returns `n_action_steps` actions and no more.
-        noise: what it can be given in place of its own draws.
-        lora_targets: modules that get an adapter, where lerobot's own choice is wrong.
-        stages: function from a configuration to the `Stage`s of its network; empty: they are not known.
-        saved_per_linear: numbers that a layer keeps for the backward pass (`training.cost.sample_cost`).
-        counts_all_layers: convolutions and attention are counted like linear layers.
-        bases: published checkpoints that recipes start from.
-        converter: function `(source, options)` that makes an `Original` of a published checkpoint.
-        convert_options: the class of its options, whose fields are also the verb's flags.
-        adapters: further adapters of its checkpoints: name -> `module:attribute`, see `policies.registry`.
-        tiny: its form in a table of tiny models; None: there is none.
-        built_tiny: context `(type)` in which lerobot builds it tiny.
-        stand_in: function `(folder, tiny)` that makes what its configuration names, without a network.
-        stand_in_fields: of the configuration, without a published tokenizer.
-    """
-
-    type: str
-    configuration: str = ""
-    wraps: str = ""
-    docs: str = ""
+    type: str  # lerobot's name of it
+    configuration: str = ""  # the module that registers it; empty: lerobot does
+    wraps: str = ""  # lerobot's type to which ours adds something; the row is then a copy of that one's
+    docs: str = ""  # page that explains it
+    # its constructor does not compute with its weights: it is built without memory for them
     is_built_empty: bool = False
+    # `module:name` in lerobot -> `module:attribute` that stands there while a policy is loaded, where
+    # lerobot would run code that comes with a checkpoint
     replaces: Mapping[str, str] = field(default_factory=dict)
-    draws_nothing: bool = False
+    draws_nothing: bool = False  # it draws nothing at inference
+    # what `reset` empties, of a type whose `predict_action_chunk` reads the frames that its own
+    # `select_action` collected. It is asked for one action at a time (`checkpoints.select_step`).
     queues: tuple[str, ...] = ()
+    # why it can be asked neither for a chunk nor for a step of one of several episodes
     why_not: str = ""
-    cuts_chunk: bool = False
-    noise: Noise | None = None
-    lora_targets: str | None = None
+    cuts_chunk: bool = False  # its `predict_action_chunk` returns `n_action_steps` actions and no more
+    noise: Noise | None = None  # what it can be given in place of its own draws
+    lora_targets: str | None = None  # modules that get an adapter, where lerobot's own choice is wrong
+    # function from a configuration to the `Stage`s of its network; empty: they are not known
     stages: str = ""
+    # numbers that a layer keeps for the backward pass (`training.cost.sample_cost`)
     saved_per_linear: float = 1.3
-    counts_all_layers: bool = False
-    bases: tuple[Base, ...] = ()
+    counts_all_layers: bool = False  # convolutions and attention are counted like linear layers
+    bases: tuple[Base, ...] = ()  # published checkpoints that recipes start from
+    # function `(source, options)` that makes an `Original` of a published checkpoint
     converter: str = ""
-    convert_options: str = ""
+    convert_options: str = ""  # the class of its options, whose fields are also the verb's flags
+    # further adapters of its checkpoints: name -> `module:attribute`, see `policies.registry`
     adapters: Mapping[str, str] = field(default_factory=dict)
-    tiny: Tiny | None = None
-    built_tiny: str = ""
+    tiny: Tiny | None = None  # its form in a table of tiny models; None: there is none
+    built_tiny: str = ""  # context `(type)` in which lerobot builds it tiny
+    # function `(folder, tiny)` that makes what its configuration names, without a network
     stand_in: str = ""
+    # of the configuration, without a published tokenizer
     stand_in_fields: Mapping[str, Any] = field(default_factory=dict)
 
     @property

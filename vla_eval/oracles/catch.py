@@ -139,15 +139,10 @@ def _advance(play: _Play, translation: model.Vector, gripper: float) -> _Play:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Catches:
-    """Makes the expert of an episode.
+    """Makes the expert of an episode."""
 
-    Attributes:
-        velocity_range_m_s: of the ball's initial speed.
-        meet_y_m: where over the lane the arm waits for the ball.
-    """
-
-    velocity_range_m_s: tuple[float, float]
-    meet_y_m: float
+    velocity_range_m_s: tuple[float, float]  # of the ball's initial speed
+    meet_y_m: float  # where over the lane the arm waits for the ball
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> CatchExpert:
         """Draw the imagined ball now, before the first observation."""

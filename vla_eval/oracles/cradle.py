@@ -69,20 +69,15 @@ FAST = CradleTactics(imagined_velocity_y_m_s=(0.75, 1.0), nominal_velocity_m_s=(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Play:
-    """State of the model: arm, ball in the plane of the table, and the controller's internal state.
-
-    Attributes:
-        stage: `wait` next to the lane, `follow` the ball, `close` the gap, `push`.
-        side_speed_m_s: the commanded speed along y while pushing.
-    """
+    """State of the model: arm, ball in the plane of the table, and the controller's internal state."""
 
     tactics: CradleTactics
     arm: model.ArmState
     ball_m: model.Vector
     ball_velocity_m_s: model.Vector
     goal_m: model.Vector
-    stage: str = "wait"
-    side_speed_m_s: float = 0.0
+    stage: str = "wait"  # `wait` next to the lane, `follow` the ball, `close` the gap, `push`
+    side_speed_m_s: float = 0.0  # the commanded speed along y while pushing
 
     @property
     def gap_m(self) -> float:

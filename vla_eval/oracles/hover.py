@@ -13,19 +13,12 @@ TOUCH_MARGIN = 1.2  # close enough is 1.2 times the height at which the arm come
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HoverExpert:
-    """Reaches a candidate without touching anything.
+    """Reaches a candidate without touching anything."""
 
-    Attributes:
-        rest_above_m: height over the candidate's centre where the tool centre point comes to rest.
-        over_radius_m: the arm descends within this horizontal distance.
-        travel_above_m: until then it keeps at least this height over the candidate's centre.
-        descend_to_m: on the way it descends to this height over the table.
-    """
-
-    rest_above_m: float
-    over_radius_m: float
-    travel_above_m: float
-    descend_to_m: float
+    rest_above_m: float  # height over the candidate's centre where the tool centre point comes to rest
+    over_radius_m: float  # the arm descends within this horizontal distance
+    travel_above_m: float  # until then it keeps at least this height over the candidate's centre
+    descend_to_m: float  # on the way it descends to this height over the table
 
     def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
         """Return (n_actions, 7) that move the arm model.towards a candidate, planned from `state` alone."""

@@ -21,17 +21,11 @@ GAIN_PER_M = 9.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LowFlight:
-    """Touches one cube after another.
+    """Touches one cube after another."""
 
-    Attributes:
-        above_top_m: height over a cube's top at which the tool centre point moves and rests.
-        near_m: the model predicts a touch within this distance of the resting point …
-        slow_m_per_step: … at no more than this speed.
-    """
-
-    above_top_m: float
-    near_m: float
-    slow_m_per_step: float
+    above_top_m: float  # height over a cube's top at which the tool centre point moves and rests
+    near_m: float  # the model predicts a touch within this distance of the resting point …
+    slow_m_per_step: float  # … at no more than this speed
 
     def plan_visits(
         self, state: PrivilegedState, wanted: Sequence[int], n_actions: int, *, in_order: bool

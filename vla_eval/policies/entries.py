@@ -24,23 +24,14 @@ from vla_eval.wire.metadata import ServerMetadata
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicyEntry:
-    """One entry of a configuration's `policies`.
+    """One entry of a configuration's `policies`."""
 
-    Attributes:
-        name: what records call it.
-        recipes: one; or one per run, for a policy of several checkpoints.
-        texts: what the configuration calls each of them.
-        is_by_run: whether each recipe is a run of its own.
-        task: the id of the only task that it is for; None: all.
-        server: of a policy behind a socket, its server's metadata.
-    """
-
-    name: str
-    recipes: tuple[Recipe[PolicyRecipe], ...]
-    texts: tuple[str, ...]
-    is_by_run: bool = False
-    task: str | None = None
-    server: ServerMetadata | None = None
+    name: str  # what records call it
+    recipes: tuple[Recipe[PolicyRecipe], ...]  # one; or one per run, for a policy of several checkpoints
+    texts: tuple[str, ...]  # what the configuration calls each of them
+    is_by_run: bool = False  # whether each recipe is a run of its own
+    task: str | None = None  # the id of the only task that it is for; None: all
+    server: ServerMetadata | None = None  # of a policy behind a socket, its server's metadata
 
     @property
     def value(self) -> PolicyRecipe:

@@ -15,22 +15,17 @@ NO_CHOICE = "none"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChoicePairs:
-    """The pairs of one policy in a world with another cue.
-
-    Attributes:
-        names: of the candidates, by index, and `NO_CHOICE` last.
-        counts: by the indices of the choices in `names`, in the world as drawn and in the other one: how many
-            pairs have these choices, and how many of them follow the cue in both worlds.
-        pairs: the pairs themselves, by run and seed.
-    """
+    """The pairs of one policy in a world with another cue."""
 
     world: World
     policy: str
     n_action_steps: int
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the candidates, by index, and `NO_CHOICE` last
+    # by the indices of the choices in `names`, in the world as drawn and in the other one: how many
+    # pairs have these choices, and how many of them follow the cue in both worlds
     counts: Mapping[tuple[int, int], int]
     following: Mapping[tuple[int, int], int]
-    pairs: tuple[Pair, ...]
+    pairs: tuple[Pair, ...]  # the pairs themselves, by run and seed
 
 
 def choice_pairs(worlds: Worlds, policy: str, n_action_steps: int) -> list[ChoicePairs]:

@@ -31,17 +31,13 @@ class Found[W]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FoundProbe:
-    """The worlds that lie in one folder.
-
-    Attributes:
-        worlds: of tasks whose world as drawn is there, too: by task, then in the order of `INTERVENTIONS`.
-        doubles: notes on run folders that have the name of another one, and are left out.
-    """
+    """The worlds that lie in one folder."""
 
     folder: Path
+    # of tasks whose world as drawn is there, too: by task, then in the order of `INTERVENTIONS`
     worlds: tuple[Found[World], ...]
     grid: tuple[Found[GridWorld], ...]
-    doubles: tuple[str, ...]
+    doubles: tuple[str, ...]  # notes on run folders that have the name of another one, and are left out
 
     def table(self) -> ProbeTable:
         """Return the table of the worlds, as `mikasa-vla probe` prints it."""

@@ -32,21 +32,15 @@ CONTROLS = (ORACLE, CUE_READER)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridSettings:
-    """What a grid varies, in addition to the chunk lengths of the evaluation.
+    """What a grid varies, in addition to the chunk lengths of the evaluation."""
 
-    Attributes:
-        axes: which phases get other lengths.
-        delays, cues: these lengths, in control steps.
-        first_inferences: which first inferences are run; none: all below K where K does not divide the
-            phases.
-        controls: whether `CONTROLS` are run with the policies.
-    """
-
-    axes: tuple[Axis, ...] = ("delay",)
+    axes: tuple[Axis, ...] = ("delay",)  # which phases get other lengths
+    # `delays`, `cues`: these lengths, in control steps
     delays: tuple[int, ...] = DEFAULT_GRID_DELAYS
     cues: tuple[int, ...] = DEFAULT_GRID_CUES
+    # which first inferences are run; none: all below K where K does not divide the phases
     first_inferences: tuple[int, ...] = ()
-    controls: bool = True
+    controls: bool = True  # whether `CONTROLS` are run with the policies
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,26 +36,19 @@ class GridPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridCell:
-    """One policy at one K with one length of a phase.
-
-    Attributes:
-        n_cue_frames: control steps at which a cue is in view.
-        parts: one for each first inference.
-        n_seeds: different episodes; each is run at every first inference.
-        chance: rate of following the cue without memory; None where it is not known.
-        reference: the control that has the same inferences and forgets nothing; None for controls, or if it
-            was not run.
-    """
+    """One policy at one K with one length of a phase."""
 
     task: str
     axis: Axis
     level: int
     policy: str
     n_action_steps: int
-    n_cue_frames: int
-    parts: tuple[GridPart, ...]
-    n_seeds: int
-    chance: float | None
+    n_cue_frames: int  # control steps at which a cue is in view
+    parts: tuple[GridPart, ...]  # one for each first inference
+    n_seeds: int  # different episodes; each is run at every first inference
+    chance: float | None  # rate of following the cue without memory; None where it is not known
+    # the control that has the same inferences and forgets nothing; None for controls, or if it was not
+    # run
     reference: str | None
 
     @property

@@ -27,19 +27,14 @@ LEAST_MOTION_STEPS = 2
 
 
 class Rule(NamedTuple):
-    """One intervention.
-
-    Attributes:
-        why_not: why there are none, for a message.
-        clause: how a sentence begins that says in how many episodes the cue is followed; `{level}` is the
-            level. Swaps have a sentence of their own.
-        needs_phases: whether it makes no sense for tasks without phases.
-    """
+    """One intervention."""
 
     worlds: Callable[[TaskWorlds], list[World]]
-    why_not: str
+    why_not: str  # why there are none, for a message
+    # how a sentence begins that says in how many episodes the cue is followed; `{level}` is the level.
+    # Swaps have a sentence of their own.
     clause: str = ""
-    needs_phases: bool = True
+    needs_phases: bool = True  # whether it makes no sense for tasks without phases
 
 
 INTERVENTIONS: Mapping[Intervention, Rule] = {

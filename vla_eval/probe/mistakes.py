@@ -38,21 +38,16 @@ class _Mistake(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Mistakes:
-    """The first mistakes of the episodes of one world.
+    """The first mistakes of the episodes of one world."""
 
-    Attributes:
-        n_episodes: episodes whose touches are known.
-        counts: by kind. `order`: an item that was shown, but out of turn; `place`: one that was not shown, at
-            a place next to that of one that was due; `identity`: another one that was not shown.
-        expected_place: so many of the last two kinds would be next to a due item if the wrong items were
-            drawn at random; None where the items are places themselves.
-        n_incomplete: no mistake, but fewer touches than are right.
-    """
-
-    n_episodes: int
+    n_episodes: int  # episodes whose touches are known
+    # by kind. `order`: an item that was shown, but out of turn; `place`: one that was not shown, at a
+    # place next to that of one that was due; `identity`: another one that was not shown.
     counts: Mapping[MistakeKind, int]
+    # so many of the last two kinds would be next to a due item if the wrong items were drawn at random;
+    # None where the items are places themselves
     expected_place: float | None
-    n_incomplete: int
+    n_incomplete: int  # no mistake, but fewer touches than are right
 
     @property
     def n_mistakes(self) -> int:

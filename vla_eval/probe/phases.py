@@ -22,20 +22,13 @@ def default_delay_steps(spec: TaskSpec) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Phases:
-    """The phases of a task whose lengths are not drawn per episode.
-
-    Attributes:
-        cue_steps: control steps for which the cue, or each of its items, is shown.
-        n_in_turn: how many items are shown one after another; 1 if all are shown at once.
-        gap_steps: steps between two of them.
-        delay_steps: steps between cue and response.
-    """
+    """The phases of a task whose lengths are not drawn per episode."""
 
     cue_after_steps: int
-    cue_steps: int
-    n_in_turn: int
-    gap_steps: int
-    delay_steps: int
+    cue_steps: int  # control steps for which the cue, or each of its items, is shown
+    n_in_turn: int  # how many items are shown one after another; 1 if all are shown at once
+    gap_steps: int  # steps between two of them
+    delay_steps: int  # steps between cue and response
     horizon_steps: int
 
     @property
@@ -107,16 +100,12 @@ def divides(phases: Phases, n_action_steps: int) -> bool:
 
 
 class Inferences(NamedTuple):
-    """Which inferences of a policy fall into the cue, and how late the first one of the response is.
+    """Which inferences of a policy fall into the cue, and how late the first one of the response is."""
 
-    Attributes:
-        cue_steps: the steps of the cue at which the policy infers; a policy that reads only the last frame
-            sees no other frame of the cue.
-        n_late: steps of the response whose actions were predicted before it began.
-    """
-
+    # the steps of the cue at which the policy infers; a policy that reads only the last frame sees no
+    # other frame of the cue
     cue_steps: tuple[int, ...]
-    n_late: int
+    n_late: int  # steps of the response whose actions were predicted before it began
 
 
 def inferences(phases: Phases, n_action_steps: int, *, first_inference_step: int = 0) -> Inferences:

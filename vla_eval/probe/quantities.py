@@ -60,25 +60,17 @@ class Pair(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SwapQuantities:
-    """Quantities of pairs with swapped cues.
-
-    Attributes:
-        sensitivity: pairs whose choice changes, or what else `change_of` says; None where none is known.
-        actions_changed: pairs whose trajectories differ.
-        warranted_choice: pairs in which the cue is followed in both worlds.
-        matched_value: mean success over both worlds, each by its own rule, with its interval.
-        reliability: pairs that succeed in both worlds.
-        p_value: exact two-sided sign test; None where there is no single right candidate.
-    """
+    """Quantities of pairs with swapped cues."""
 
     change_of: ChangeOf | None
+    # pairs whose choice changes, or what else `change_of` says; None where none is known
     sensitivity: Share | None
-    actions_changed: Share | None
-    warranted_choice: Share
-    matched_value: float
+    actions_changed: Share | None  # pairs whose trajectories differ
+    warranted_choice: Share  # pairs in which the cue is followed in both worlds
+    matched_value: float  # mean success over both worlds, each by its own rule, with its interval
     matched_interval: Interval
-    reliability: Share
-    p_value: float | None
+    reliability: Share  # pairs that succeed in both worlds
+    p_value: float | None  # exact two-sided sign test; None where there is no single right candidate
 
 
 def pair_up(drawn: Sequence[EpisodeRecord], other: Sequence[EpisodeRecord]) -> list[Pair]:

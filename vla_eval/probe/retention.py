@@ -31,14 +31,10 @@ class Range(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HalfLife:
-    """The delay at which half of what is above chance at the shortest delay is left.
+    """The delay at which half of what is above chance at the shortest delay is left."""
 
-    Attributes:
-        steps: None if more than half is left at the longest delay.
-        interval: at 95 %, by bootstrap over seeds; an end that is None lies beyond the longest delay.
-    """
-
-    steps: float | None
+    steps: float | None  # None if more than half is left at the longest delay
+    # at 95 %, by bootstrap over seeds; an end that is None lies beyond the longest delay
     interval: Range
     longest_delay: int
 

@@ -18,21 +18,14 @@ MOVED_M = 0.05  # half the distance between two neighbouring places: below it, t
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Habit:
-    """Wrong choices that go to one place (or item) more often than expected by chance.
+    """Wrong choices that go to one place (or item) more often than expected by chance."""
 
-    Attributes:
-        index: the place or item with the smallest p value among the wrong choices.
-        n_chosen: number of wrong choices that went to it.
-        n_possible: number of wrong choices that could go to it: those of episodes in which it was wrong.
-        by_luck: the share that would go to it if all wrong ones were equally likely: 1/(N - 1).
-        p_value: one-sided exact binomial test, times N because N were tested (Bonferroni).
-    """
-
-    index: int
-    n_chosen: int
+    index: int  # the place or item with the smallest p value among the wrong choices
+    n_chosen: int  # number of wrong choices that went to it
+    # number of wrong choices that could go to it: those of episodes in which it was wrong
     n_possible: int
-    by_luck: float
-    p_value: float
+    by_luck: float  # the share that would go to it if all wrong ones were equally likely: 1/(N - 1)
+    p_value: float  # one-sided exact binomial test, times N because N were tested (Bonferroni)
 
     @property
     def is_found(self) -> bool:

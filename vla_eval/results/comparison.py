@@ -26,23 +26,16 @@ ChanceSource = Literal["cue_blind", "1/N", "catalogue"]
 
 
 class Success(NamedTuple):
-    """Success once of a row; everything is None without a result.
+    """Success once of a row; everything is None without a result."""
 
-    Attributes:
-        n_success_once: how many episodes succeeded at any step.
-        success_once: their share; over several runs the mean of the run means.
-        ci_low, ci_high, interval: its 95 % interval, and the kind of the interval.
-        n_runs: independent runs with a result.
-        sem: standard error over them.
-    """
-
-    n_success_once: int | None = None
-    success_once: float | None = None
+    n_success_once: int | None = None  # how many episodes succeeded at any step
+    success_once: float | None = None  # their share; over several runs the mean of the run means
+    # `ci_low`, `ci_high`, `interval`: its 95 % interval, and the kind of the interval
     ci_low: float | None = None
     ci_high: float | None = None
     interval: IntervalKind | None = None
-    n_runs: int = 0
-    sem: float | None = None
+    n_runs: int = 0  # independent runs with a result
+    sem: float | None = None  # standard error over them
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

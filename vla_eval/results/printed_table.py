@@ -15,48 +15,31 @@ UNDEFINED = "—"
 
 @dataclass(frozen=True, slots=True)
 class Column[R]:
-    """One column of a table for reading.
+    """One column of a table for reading."""
 
-    Attributes:
-        title: above it.
-        cell: of a row.
-        is_number: aligned to the right.
-        folds: goes into the line above the table if it has the same cell in all rows.
-        rank: columns are left out from the highest rank on if the table would be too wide; 0: never.
-        name: what `--columns` calls it.
-        is_extra: shown only if it is named.
-        is_last: at the right end.
-        is_code: names and messages, which a page sets as code.
-    """
-
-    title: str
-    cell: Callable[[R], str]
-    is_number: bool = True
+    title: str  # above it
+    cell: Callable[[R], str]  # of a row
+    is_number: bool = True  # aligned to the right
     _: KW_ONLY
-    folds: bool = False
+    folds: bool = False  # goes into the line above the table if it has the same cell in all rows
+    # columns are left out from the highest rank on if the table would be too wide; 0: never
     rank: int = 0
-    name: str = ""
-    is_extra: bool = False
-    is_last: bool = False
-    is_code: bool = False
+    name: str = ""  # what `--columns` calls it
+    is_extra: bool = False  # shown only if it is named
+    is_last: bool = False  # at the right end
+    is_code: bool = False  # names and messages, which a page sets as code
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PrintedTable:
-    """A table for reading, and its notes.
-
-    Attributes:
-        rows: as many cells each; without rows only the notes appear.
-        notes: whole sentences.
-        same: title and cell of each column that has the same cell in all rows, for a line above the table.
-        title: of a table below another one: a sentence without its full stop.
-    """
+    """A table for reading, and its notes."""
 
     columns: Sequence[Column[Any]]
-    rows: Sequence[Sequence[str]]
-    notes: Sequence[str] = ()
+    rows: Sequence[Sequence[str]]  # as many cells each; without rows only the notes appear
+    notes: Sequence[str] = ()  # whole sentences
+    # title and cell of each column that has the same cell in all rows, for a line above the table
     same: Sequence[tuple[str, str]] = ()
-    title: str = ""
+    title: str = ""  # of a table below another one: a sentence without its full stop
 
     @property
     def titles(self) -> list[str]:
@@ -99,16 +82,12 @@ class SideTable(PrintedTable):
     """A table below the success table: a protocol's figures, published results.
 
     Its rows are never rows of the success table, so that nothing published is mistaken for a measured value.
-
-    Attributes:
-        csv_columns: those that the success table has not.
-        csv_rows: column -> value; `source` says that they are not measured episodes.
-        json: fields that it adds to the JSON report.
     """
 
-    csv_columns: Sequence[str] = ()
+    csv_columns: Sequence[str] = ()  # those that the success table has not
+    # column -> value; `source` says that they are not measured episodes
     csv_rows: Sequence[Mapping[str, object]] = ()
-    json: Mapping[str, object] = field(default_factory=dict)
+    json: Mapping[str, object] = field(default_factory=dict)  # fields that it adds to the JSON report
 
 
 def cells_of[R](columns: Sequence[Column[R]], rows: Iterable[R]) -> tuple[tuple[str, ...], ...]:

@@ -86,53 +86,40 @@ class Row:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProtocolRow:
-    """The summary figure of one policy at one K.
-
-    Attributes:
-        group: the part of its tasks that the figure is over; None: all.
-        n_tasks, n_runs: over how many tasks and runs the figure is.
-        mean: mean over the tasks of success once; over several runs the mean of the run means. None where
-            something departs from the protocol.
-        sem: standard error over the runs.
-        departures: what is not as the protocol says.
-    """
+    """The summary figure of one policy at one K."""
 
     protocol: str
     version: int
-    group: str | None
+    group: str | None  # the part of its tasks that the figure is over; None: all
     policy: str
     n_action_steps: int
     variant: str | None
+    # `n_tasks`, `n_runs`: over how many tasks and runs the figure is
     n_tasks: int
     n_runs: int
+    # mean over the tasks of success once; over several runs the mean of the run means. None where
+    # something departs from the protocol.
     mean: float | None = None
     ci_low: float | None = None
     ci_high: float | None = None
     interval: SummaryInterval | None = None
-    sem: float | None = None
+    sem: float | None = None  # standard error over the runs
     lowest: float | None = None
     highest: float | None = None
-    departures: tuple[str, ...] = ()
+    departures: tuple[str, ...] = ()  # what is not as the protocol says
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """Rows and their notes.
+    """Rows and their notes."""
 
-    Attributes:
-        rows: in the order of the configuration.
-        run_rows: the runs of each row that has several.
-        n_comparisons: how many p values were corrected together.
-        runs: run folder -> name of its configuration.
-        protocols: the summary figures of published protocols, as far as the runs name any.
-    """
-
-    rows: tuple[Row, ...]
-    run_rows: tuple[Row, ...] = ()
+    rows: tuple[Row, ...]  # in the order of the configuration
+    run_rows: tuple[Row, ...] = ()  # the runs of each row that has several
     notes: tuple[str, ...]
     baselines: tuple[str, ...]
-    n_comparisons: int
-    runs: Mapping[str, str]
+    n_comparisons: int  # how many p values were corrected together
+    runs: Mapping[str, str]  # run folder -> name of its configuration
+    # the summary figures of published protocols, as far as the runs name any
     protocols: tuple[ProtocolRow, ...] = ()
 
     @property

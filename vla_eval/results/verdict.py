@@ -21,16 +21,12 @@ VERBS: Mapping[Finding, str] = {
 
 
 class Verdict(NamedTuple):
-    """What a table shows of one task.
-
-    Attributes:
-        sentences: the best policy first; one for all n_action_steps of a policy at which the same was found.
-        is_compared: whether any policy was compared with chance.
-    """
+    """What a table shows of one task."""
 
     task: str
+    # the best policy first; one for all n_action_steps of a policy at which the same was found
     sentences: tuple[str, ...]
-    is_compared: bool
+    is_compared: bool  # whether any policy was compared with chance
 
 
 def verdicts(table: Table) -> list[Verdict]:

@@ -30,29 +30,20 @@ type JsonValue = bool | int | float | str | Sequence[JsonValue] | Mapping[str, J
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunDescription:
-    """What makes a run this run: compared on resume, but for options, command and what weights imply.
-
-    Attributes:
-        config: the resolved configuration, as far as results depend on it.
-        recipes: recipe as shown -> sha256.
-        environment: commit, versions, device; a change may be allowed.
-        options: workers, timeouts and the like.
-        command: what the user typed.
-        normalization: learned policy -> by which statistics it normalises; not compared.
-        servers: policy behind a socket -> its server's description.
-        shard: which part of the plan it is; None: all of it.
-        training_seeds: seeds of the demonstrations that policies were trained on, where known; not compared.
-    """
+    """What makes a run this run: compared on resume, but for options, command and what weights imply."""
 
     name: str
-    config: Mapping[str, JsonValue]
-    recipes: Mapping[str, str]
-    environment: Mapping[str, JsonValue]
-    options: Mapping[str, JsonValue]
-    command: str
+    config: Mapping[str, JsonValue]  # the resolved configuration, as far as results depend on it
+    recipes: Mapping[str, str]  # recipe as shown -> sha256
+    environment: Mapping[str, JsonValue]  # commit, versions, device; a change may be allowed
+    options: Mapping[str, JsonValue]  # workers, timeouts and the like
+    command: str  # what the user typed
+    # learned policy -> by which statistics it normalises; not compared
     normalization: Mapping[str, JsonValue] = field(default_factory=dict)
+    # policy behind a socket -> its server's description
     servers: Mapping[str, JsonValue] = field(default_factory=dict)
-    shard: Shard | None = None
+    shard: Shard | None = None  # which part of the plan it is; None: all of it
+    # seeds of the demonstrations that policies were trained on, where known; not compared
     training_seeds: Mapping[str, Mapping[str, tuple[SeedRange, ...]]] = field(default_factory=dict)
 
 

@@ -17,17 +17,12 @@ WRITTEN = re.compile(r"(\d{1,6})/(\d{1,6})", re.ASCII)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Shard:
-    """One of `count` disjoint parts.
+    """One of `count` disjoint parts."""
 
-    Attributes:
-        number: from 1.
-        block_size: consecutive episodes that stay together, since they run side by side.
-        groups: (task, policy, n_action_steps) of all episodes of the plan, in its order.
-    """
-
-    number: Positive
+    number: Positive  # from 1
     count: Positive
-    block_size: Positive = 1
+    block_size: Positive = 1  # consecutive episodes that stay together, since they run side by side
+    # (task, policy, n_action_steps) of all episodes of the plan, in its order
     groups: tuple[tuple[str, str, Positive], ...] = ()
 
     @classmethod

@@ -32,17 +32,11 @@ MAX_SHOWN = 80  # characters of what was found
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """Where JSON is from, for messages.
+    """Where JSON is from, for messages."""
 
-    Attributes:
-        where: file, and line where there are several.
-        what: what is expected there, with its article: `an episode record`.
-        remedy: what to do if it is something else; whole sentences.
-    """
-
-    where: str
-    what: str
-    remedy: str
+    where: str  # file, and line where there are several
+    what: str  # what is expected there, with its article: `an episode record`
+    remedy: str  # what to do if it is something else; whole sentences
     error: type[VlaEvalError]
 
     def refuse(self, found: str, problem: object) -> VlaEvalError:

@@ -27,17 +27,12 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Study:
-    """The rows and tasks of a table that were asked for, and its folder.
-
-    Attributes:
-        adapters: of a table of tiny random models: row -> adapter of its own; else empty.
-        command: what the user typed, for the record.
-    """
+    """The rows and tasks of a table that were asked for, and its folder."""
 
     table: ModelTable
     out: Path
-    adapters: dict[str, str]
-    command: str
+    adapters: dict[str, str]  # of a table of tiny random models: row -> adapter of its own; else empty
+    command: str  # what the user typed, for the record
 
     @property
     def is_tiny(self) -> bool:

@@ -20,28 +20,22 @@ class Estimated:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rehearsed:
-    """What was measured; memory and seconds are by stage.
+    """What was measured; memory and seconds are by stage."""
 
-    Attributes:
-        recipe, kind, dtype, device: what was rehearsed; a folder's path where it was a checkpoint.
-        trained: what the recipe trains of it, adapters included; None for a checkpoint.
-        before_bytes: memory of the process before anything was made: torch, transformers, lerobot.
-        limit_bytes: 1.15 × the weights + 2 GB, which loading and acting must keep.
-    """
-
+    # `recipe`, `kind`, `dtype`, `device`: what was rehearsed; a folder's path where it was a checkpoint
     recipe: str
     kind: str
     dtype: str
     device: str
     parameters: int
-    trained: int | None
+    trained: int | None  # what the recipe trains of it, adapters included; None for a checkpoint
     bytes: int
     peak_rss_bytes: Mapping[str, int]
     peak_device_bytes: int | None
     seconds: Mapping[str, float]
     inferences_per_second: Mapping[int, float]
-    before_bytes: int
-    limit_bytes: int
+    before_bytes: int  # memory of the process before anything was made: torch, transformers, lerobot
+    limit_bytes: int  # 1.15 × the weights + 2 GB, which loading and acting must keep
     estimated: Estimated
 
     @property

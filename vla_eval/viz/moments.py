@@ -15,16 +15,11 @@ JPEG_QUALITY = 90
 
 
 class Moments(NamedTuple):
-    """Captured steps of an episode.
-
-    Attributes:
-        reveal: the first one of the response phase; without phases, the one in the middle.
-        touch: the first one at which a candidate has been touched; else the last one.
-    """
+    """Captured steps of an episode."""
 
     cue: TapedStep
-    reveal: TapedStep
-    touch: TapedStep
+    reveal: TapedStep  # the first one of the response phase; without phases, the one in the middle
+    touch: TapedStep  # the first one at which a candidate has been touched; else the last one
 
 
 def find_moments(tape: EpisodeTape) -> Moments:

@@ -35,53 +35,41 @@ class CameraImage(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ServerMetadata:
-    """What a server reports about itself and its policy. None: it does not say.
+    """What a server reports about itself and its policy. None: it does not say."""
 
-    Attributes:
-        protocol: `openpi+1` if it is a server of this wire; a field that is None then means: there is none.
-        weights_known: whether it says which weights the policy has.
-        weights_sha256: digest of the weights; None for a policy without weights, or if not known.
-        chunk_size: actions of one reply.
-        n_action_steps: actions executed per inference, where the evaluation names no number.
-        control_mode, action_dims, control_hz: what the actions are for; `action_dims` are their names.
-        cameras: our name of a camera -> how its image is sent.
-        state_key, state_dims: key and names of the proprioceptive vector.
-        state_layouts: name of a layout -> names of its numbers, for every layout that the server accepts.
-        prompt_key: key of the instruction.
-        needs_every_frame: whether the policy must see each control step.
-        needs_session_id: whether requests must name their session.
-        batch_max: rows of a shared pass; see `EpisodeStart.row`.
-        supports: which of `reset`, `observe`, `seed` and `row` may be sent.
-        versions: package -> version, at the server.
-        training_seeds: task -> the seeds of the demonstrations that the policy was trained on.
-        sentences: task -> the sentences that the policy was trained with.
-        other: what else it says.
-    """
-
+    # `openpi+1` if it is a server of this wire; a field that is None then means: there is none
     protocol: str | None = None
     name: str | None = None
-    weights_known: bool = False
+    weights_known: bool = False  # whether it says which weights the policy has
+    # digest of the weights; None for a policy without weights, or if not known
     weights_sha256: str | None = None
     recipe_sha256: str | None = None
-    chunk_size: int | None = None
+    chunk_size: int | None = None  # actions of one reply
+    # actions executed per inference, where the evaluation names no number
     n_action_steps: int | None = None
+    # `control_mode`, `action_dims`, `control_hz`: what the actions are for; `action_dims` are their
+    # names
     control_mode: str | None = None
     action_dims: tuple[str, ...] | None = None
     control_hz: float | None = None
-    cameras: Mapping[str, CameraImage] | None = None
+    cameras: Mapping[str, CameraImage] | None = None  # our name of a camera -> how its image is sent
+    # `state_key`, `state_dims`: key and names of the proprioceptive vector
     state_key: str | None = None
     state_dims: tuple[str, ...] | None = None
+    # name of a layout -> names of its numbers, for every layout that the server accepts
     state_layouts: Mapping[str, tuple[str, ...]] | None = None
-    prompt_key: str | None = None
-    needs_every_frame: bool | None = None
-    needs_session_id: bool | None = None
-    batch_max: int | None = None
-    supports: tuple[str, ...] = ()
-    versions: Mapping[str, str] | None = None
+    prompt_key: str | None = None  # key of the instruction
+    needs_every_frame: bool | None = None  # whether the policy must see each control step
+    needs_session_id: bool | None = None  # whether requests must name their session
+    batch_max: int | None = None  # rows of a shared pass; see `EpisodeStart.row`
+    supports: tuple[str, ...] = ()  # which of `reset`, `observe`, `seed` and `row` may be sent
+    versions: Mapping[str, str] | None = None  # package -> version, at the server
     n_sessions: int | None = None
+    # task -> the seeds of the demonstrations that the policy was trained on
     training_seeds: Mapping[str, tuple[SeedRange, ...]] | None = None
+    # task -> the sentences that the policy was trained with
     sentences: Mapping[str, tuple[str, ...]] | None = None
-    other: Mapping[str, Any] = field(default_factory=dict)
+    other: Mapping[str, Any] = field(default_factory=dict)  # what else it says
 
     @property
     def is_ours(self) -> bool:

@@ -9,19 +9,13 @@ from vla_eval.errors import VlaEvalError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Needed:
-    """A path, as the planning machine has it.
+    """A path, as the planning machine has it."""
 
-    Attributes:
-        path: absolute, or below the working directory.
-        sha256: its digest; None: it is enough that it is there.
-        digest: what computes the digest.
-        folders: those that it consists of, if they are small enough to be sent to a machine that does not
-            have them (`parcel.MAX_PARCEL_BYTES`); empty: it must be there.
-    """
-
-    path: str
-    sha256: str | None = None
-    digest: Callable[[Path], str] | None = None
+    path: str  # absolute, or below the working directory
+    sha256: str | None = None  # its digest; None: it is enough that it is there
+    digest: Callable[[Path], str] | None = None  # what computes the digest
+    # those that it consists of, if they are small enough to be sent to a machine that does not have them
+    # (`parcel.MAX_PARCEL_BYTES`); empty: it must be there
     folders: tuple[str, ...] = ()
 
     def absent(self) -> tuple[str, ...]:

@@ -40,20 +40,13 @@ WorkerMain = Callable[[Connection, SharedStage, Path], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkerSpec:
-    """What the workers of a pool are made of, wherever they run.
+    """What the workers of a pool are made of, wherever they run."""
 
-    Attributes:
-        runner: what answers each job `J` by an `A` or a `Failed`.
-        answers: the classes of `A`; anything else that a worker sends is an error.
-        timeouts: how long a worker may be busy with one thing.
-        logs: folder for what workers of this machine write to standard output and error.
-        preload: modules that they need and that take long to import; see `worker_context`.
-    """
-
-    runner: RunnerClass
-    answers: tuple[type, ...]
-    timeouts: TimeoutConfig
-    logs: Path
+    runner: RunnerClass  # what answers each job `J` by an `A` or a `Failed`
+    answers: tuple[type, ...]  # the classes of `A`; anything else that a worker sends is an error
+    timeouts: TimeoutConfig  # how long a worker may be busy with one thing
+    logs: Path  # folder for what workers of this machine write to standard output and error
+    # modules that they need and that take long to import; see `worker_context`
     preload: tuple[str, ...] = ()
 
     @property

@@ -17,15 +17,10 @@ from vla_eval.workers.backend import Backend
 
 
 class Evaluations(NamedTuple):
-    """The result of several evaluations.
+    """The result of several evaluations."""
 
-    Attributes:
-        n_errors: episodes that ended in an error.
-        stopped: the exit code if a signal has stopped them; None: all are there.
-    """
-
-    n_errors: int
-    stopped: int | None
+    n_errors: int  # episodes that ended in an error
+    stopped: int | None  # the exit code if a signal has stopped them; None: all are there
 
 
 def evaluate_one(

@@ -15,30 +15,23 @@ Numbers = NDArray[np.generic]
 
 @dataclass(frozen=True, kw_only=True)
 class Demonstrations:
-    """The numbers and sentences of all episodes, frame after frame.
-
-    Attributes:
-        columns: field -> (N,) or (N, D) numbers.
-        dims: field -> the names of its D numbers; a field is absent if they are not known.
-        sentences: (N,) the language instruction of each frame, None if there is none; or empty, if what is
-            made of them has none.
-        action: what the actions are for; None if that is not known.
-        image_sizes_px: camera -> height and width.
-        expected_px: height and width that images shall have; None: any, if it is the same for all.
-        is_gripper_named: whether the user has said what the gripper's commands mean.
-    """
+    """The numbers and sentences of all episodes, frame after frame."""
 
     where: Path
     fps: float
     names: tuple[str, ...]
     lengths: tuple[int, ...]
-    columns: Mapping[str, Numbers]
+    columns: Mapping[str, Numbers]  # field -> (N,) or (N, D) numbers
+    # field -> the names of its D numbers; a field is absent if they are not known
     dims: Mapping[str, tuple[str, ...]]
+    # (N,) the language instruction of each frame, None if there is none; or empty, if what is made of
+    # them has none
     sentences: tuple[str | None, ...]
-    action: ActionSpec | None
-    image_sizes_px: Mapping[str, tuple[int, int]]
+    action: ActionSpec | None  # what the actions are for; None if that is not known
+    image_sizes_px: Mapping[str, tuple[int, int]]  # camera -> height and width
+    # height and width that images shall have; None: any, if it is the same for all
     expected_px: int | None = None
-    is_gripper_named: bool = False
+    is_gripper_named: bool = False  # whether the user has said what the gripper's commands mean
 
     @property
     def n_frames(self) -> int:

@@ -47,18 +47,12 @@ from vla_eval.workers.local import LOCAL
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Converted:
-    """The outcome of a conversion.
-
-    Attributes:
-        n_episodes: episodes of the old dataset.
-        n_same_states: how many of the new ones have the old one's states, bit for bit.
-        left_out: a sentence for each episode that is not in the new one.
-    """
+    """The outcome of a conversion."""
 
     dataset: RecordedDataset
-    n_episodes: int
-    n_same_states: int
-    left_out: tuple[str, ...]
+    n_episodes: int  # episodes of the old dataset
+    n_same_states: int  # how many of the new ones have the old one's states, bit for bit
+    left_out: tuple[str, ...]  # a sentence for each episode that is not in the new one
 
 
 def convert_control_mode(

@@ -37,22 +37,16 @@ PER_STEP = (REWARD_KEY, SUCCESS_KEY, DONE_KEY)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SourceEpisode:
-    """One demonstration as its source has it.
-
-    Attributes:
-        numbers: field, by our name -> (T,) or (T, D), in the source's type.
-        sentences: (T,) the language instruction at each frame; None if the source has none.
-        image_sizes_px: height and width of the base and the wrist camera.
-        read_images: decodes them; raises `DatasetError`.
-        seed: the episode's seed in the source's environment (not in ours).
-    """
+    """One demonstration as its source has it."""
 
     name: str
-    numbers: Mapping[str, Numbers]
+    numbers: Mapping[str, Numbers]  # field, by our name -> (T,) or (T, D), in the source's type
+    # (T,) the language instruction at each frame; None if the source has none
     sentences: tuple[str | None, ...]
+    # height and width of the base and the wrist camera
     image_sizes_px: tuple[tuple[int, int], tuple[int, int]]
-    read_images: Callable[[], CameraImages]
-    seed: int | None = None
+    read_images: Callable[[], CameraImages]  # decodes them; raises `DatasetError`
+    seed: int | None = None  # the episode's seed in the source's environment (not in ours)
 
     @property
     def n_frames(self) -> int:
@@ -62,22 +56,15 @@ class SourceEpisode:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Source:
-    """Demonstrations that were found; one or more episodes, which all have the same numbers.
-
-    Attributes:
-        layout: see docs/dataset_tools.md.
-        files: what they were read from.
-        left_out: fields of the source that have no place in ours.
-        remarks: what was assumed.
-    """
+    """Demonstrations that were found; one or more episodes, which all have the same numbers."""
 
     path: Path
-    layout: Layout
-    files: Sequence[Path]
+    layout: Layout  # see docs/dataset_tools.md
+    files: Sequence[Path]  # what they were read from
     fps: float
     episodes: tuple[SourceEpisode, ...]
-    left_out: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()  # fields of the source that have no place in ours
+    remarks: tuple[str, ...] = ()  # what was assumed
 
     def __post_init__(self) -> None:
         """Check that the episodes can be one dataset."""

@@ -26,33 +26,24 @@ Frames = dict[str, ImageArray]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InitialState:
-    """How one episode of a dataset begins.
-
-    Attributes:
-        seed: of its own environment; None if it is not known.
-        kind, state: proprioception of the first frame as `features.proprioception` gives it.
-    """
+    """How one episode of a dataset begins."""
 
     name: str
-    seed: int | None
+    seed: int | None  # of its own environment; None if it is not known
+    # `kind`, `state`: proprioception of the first frame as `features.proprioception` gives it
     kind: StateKind
     state: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InitialStates:
-    """How the episodes of a dataset begin.
-
-    Attributes:
-        task: task id; None if the dataset names none.
-        simulator: of the recording; ManiSkill for what was not recorded here.
-        read_frames: reads the first frame of each episode; decoding takes a while.
-    """
+    """How the episodes of a dataset begin."""
 
     path: Path
-    task: str | None
-    simulator: Simulator
+    task: str | None  # task id; None if the dataset names none
+    simulator: Simulator  # of the recording; ManiSkill for what was not recorded here
     episodes: tuple[InitialState, ...]
+    # reads the first frame of each episode; decoding takes a while
     read_frames: Callable[[], list[Frames]]
 
 

@@ -41,20 +41,14 @@ class SharedStart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LeakReport:
-    """What a comparison found.
-
-    Attributes:
-        seeds: of the evaluation.
-        n_episodes: of the dataset.
-        evidence: what was compared: the arm's state, or first frames where that is the same for all seeds.
-        shared: the episodes that begin alike.
-    """
+    """What a comparison found."""
 
     task: str
-    seeds: range
-    n_episodes: int
+    seeds: range  # of the evaluation
+    n_episodes: int  # of the dataset
+    # what was compared: the arm's state, or first frames where that is the same for all seeds
     evidence: Evidence
-    shared: tuple[SharedStart, ...]
+    shared: tuple[SharedStart, ...]  # the episodes that begin alike
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -24,23 +24,16 @@ N_SEED_BITS = 63
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Episode:
-    """A running episode as it is at one inference.
+    """A running episode as it is at one inference."""
 
-    Attributes:
-        start: what it began with.
-        frames: the newest frames that an inference may read, oldest first.
-        unseen: the frames since the previous inference, oldest first.
-        memory: what the policy remembers of the frames before; None at the beginning.
-        earlier: the earlier frames that the policy is shown as further images; None: it is shown none.
-        step: of the newest frame.
-    """
-
-    start: EpisodeStart
-    frames: tuple[Frame, ...] = ()
-    unseen: tuple[Frame, ...] = ()
+    start: EpisodeStart  # what it began with
+    frames: tuple[Frame, ...] = ()  # the newest frames that an inference may read, oldest first
+    unseen: tuple[Frame, ...] = ()  # the frames since the previous inference, oldest first
+    # what the policy remembers of the frames before; None at the beginning
     memory: Any = None  # whatever the policy's `remember` returns
+    # the earlier frames that the policy is shown as further images; None: it is shown none
     earlier: FrameMemory | None = None
-    step: int = 0
+    step: int = 0  # of the newest frame
 
     def shown(self, unseen: Sequence[Frame], *, step: int, n_kept: int) -> "Episode":
         """Return the episode after these frames, of which an inference may read the newest `n_kept`."""

@@ -20,28 +20,18 @@ of 750 with three cubes to touch, 731 have three, the others two."""
 
 
 class Episodes(NamedTuple):
-    """A batch of B episodes of T steps, from their beginning; padding comes last.
+    """A batch of B episodes of T steps, from their beginning; padding comes last."""
 
-    Attributes:
-        images: (N, cameras, 3, H, W), as they were handed over (see `in_numbers`): those of `first`, one
-            episode after the other. Most of (B, T) is padding, and images are nearly all of the work.
-        first: (B, T) where a frame is shown for the first time; False for padding.
-        state: (B, T, state).
-        actions: (B, T, chunk, action).
-        counts: (B, T, chunk) float, 0 for what is beyond the episode.
-        goal_counts: (B, T) float, how much the goal counts at each step.
-        goal_m: (B, 3) the tool centre point at the episode's end.
-        steps: (B, T) which step of the window each is.
-    """
-
+    # (N, cameras, 3, H, W), as they were handed over (see `in_numbers`): those of `first`, one episode
+    # after the other. Most of (B, T) is padding, and images are nearly all of the work.
     images: Tensor
-    first: Tensor
-    state: Tensor
-    actions: Tensor
-    counts: Tensor
-    goal_counts: Tensor
-    goal_m: Tensor
-    steps: Tensor
+    first: Tensor  # (B, T) where a frame is shown for the first time; False for padding
+    state: Tensor  # (B, T, state)
+    actions: Tensor  # (B, T, chunk, action)
+    counts: Tensor  # (B, T, chunk) float, 0 for what is beyond the episode
+    goal_counts: Tensor  # (B, T) float, how much the goal counts at each step
+    goal_m: Tensor  # (B, 3) the tool centre point at the episode's end
+    steps: Tensor  # (B, T) which step of the window each is
 
     @property
     def frames(self) -> Tensor:

@@ -29,19 +29,12 @@ TRUST_SCALE = 10.0  # so that an optimizer's steps of 0.002 stop listening withi
 
 
 class Goals(NamedTuple):
-    """Where to go.
+    """Where to go."""
 
-    Attributes:
-        pointed: (N, cameras, heads, 3) by each look-up alone.
-        shares: (N, cameras, heads) how far each is believed among those of its camera; of sum 1.
-        camera_shares: (N, cameras) how far each camera is; of sum 1.
-        evidence: (N, cameras, 3) for each camera.
-    """
-
-    pointed: Tensor
-    shares: Tensor
-    camera_shares: Tensor
-    evidence: Tensor
+    pointed: Tensor  # (N, cameras, heads, 3) by each look-up alone
+    shares: Tensor  # (N, cameras, heads) how far each is believed among those of its camera; of sum 1
+    camera_shares: Tensor  # (N, cameras) how far each camera is; of sum 1
+    evidence: Tensor  # (N, cameras, 3) for each camera
 
     @property
     def alone(self) -> Tensor:

@@ -35,57 +35,36 @@ NOTHING = -1e4  # logarithm of a weight of 0, finite
 
 
 class Answer(NamedTuple):
-    """Outputs of the network for each step.
+    """Outputs of the network for each step."""
 
-    Attributes:
-        actions: (B, T, chunk, action); joint positions in units of `JOINT_UNIT_RAD`.
-        doubts: (B, T, chunk) > 0, the squared error that is expected of each action. No gradient flows from
-            it into anything but its own layer.
-        goal_m: (B, T, 3) where the demonstration's tool centre point ends, predicted from what the memory
-            looked up alone.
-        pointed_m: (B, T, cameras, heads, 3) the same by each look-up alone.
-        shares: (B, T, cameras, heads) weight of each among those of its camera.
-        camera_shares: (B, T, cameras) weight of each camera.
-        evidence: (B, T, cameras, 3) of each camera: what its share is computed from.
-    """
-
-    actions: Tensor
+    actions: Tensor  # (B, T, chunk, action); joint positions in units of `JOINT_UNIT_RAD`
+    # (B, T, chunk) > 0, the squared error that is expected of each action. No gradient flows from it
+    # into anything but its own layer.
     doubts: Tensor
+    # (B, T, 3) where the demonstration's tool centre point ends, predicted from what the memory looked
+    # up alone
     goal_m: Tensor
-    pointed_m: Tensor
-    shares: Tensor
-    camera_shares: Tensor
-    evidence: Tensor
+    pointed_m: Tensor  # (B, T, cameras, heads, 3) the same by each look-up alone
+    shares: Tensor  # (B, T, cameras, heads) weight of each among those of its camera
+    camera_shares: Tensor  # (B, T, cameras) weight of each camera
+    evidence: Tensor  # (B, T, cameras, 3) of each camera: what its share is computed from
 
 
 class Sight(NamedTuple):
-    """What is seen at N steps.
+    """What is seen at N steps."""
 
-    Attributes:
-        places: per camera.
-        keys: per camera (N, P, key + KNOWN).
-        things: (N, cameras · heads, value) what stood out.
-        summary: (N, hidden).
-    """
-
-    places: list[Places]
-    keys: list[Tensor]
-    things: Tensor
-    summary: Tensor
+    places: list[Places]  # per camera
+    keys: list[Tensor]  # per camera (N, P, key + KNOWN)
+    things: Tensor  # (N, cameras · heads, value) what stood out
+    summary: Tensor  # (N, hidden)
 
 
 class Memory(NamedTuple):
-    """What is kept from step to step.
+    """What is kept from step to step."""
 
-    Attributes:
-        things: (B, cameras · heads, value) the weighted mean of what was seen.
-        importance: (B, cameras · heads) logarithm of the sum of its weights.
-        rest: (B, memory) everything else.
-    """
-
-    things: Tensor
-    importance: Tensor
-    rest: Tensor
+    things: Tensor  # (B, cameras · heads, value) the weighted mean of what was seen
+    importance: Tensor  # (B, cameras · heads) logarithm of the sum of its weights
+    rest: Tensor  # (B, memory) everything else
 
 
 class MemoryNetwork(nn.Module):

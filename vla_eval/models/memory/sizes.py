@@ -14,31 +14,21 @@ QUARTERS = HALVES**2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkSizes:
-    """Sizes of the network.
+    """Sizes of the network."""
 
-    Attributes:
-        on_arm: of each image of a step, whether its camera is on the arm.
-        image_px: height and width of an image, a multiple of `patch_px`.
-        channels: learned features of a place in an image.
-        patch_px: edge of such a place, a multiple of `SPOTS`.
-        heads: questions per camera: so many fixed ones, and so many of the memory.
-        key: numbers of a question.
-        longest_span_steps: the slowest units of the memory begin with a time scale of so many steps.
-        free_translation: whether a part of the translation does not depend on the goal.
-    """
-
-    on_arm: tuple[bool, ...] = (False, True)
-    image_px: int = 128
+    on_arm: tuple[bool, ...] = (False, True)  # of each image of a step, whether its camera is on the arm
+    image_px: int = 128  # height and width of an image, a multiple of `patch_px`
     action: int = 7
     chunk: int = 8
-    channels: int = 32
-    patch_px: int = 4
-    heads: int = 8
-    key: int = 16
+    channels: int = 32  # learned features of a place in an image
+    patch_px: int = 4  # edge of such a place, a multiple of `SPOTS`
+    heads: int = 8  # questions per camera: so many fixed ones, and so many of the memory
+    key: int = 16  # numbers of a question
     memory: int = 256
     hidden: int = 256
+    # the slowest units of the memory begin with a time scale of so many steps
     longest_span_steps: float = 100.0
-    free_translation: bool = False
+    free_translation: bool = False  # whether a part of the translation does not depend on the goal
     joint_targets: bool = False
     reads_sentence: bool = False
 

@@ -17,14 +17,10 @@ LEAST_COLOR_VARIANCE = 1e-3  # colours in [-1, 1]: less than this is noise of th
 
 
 class Places(NamedTuple):
-    """What the encoder extracts at P places, or what was looked at there.
+    """What the encoder extracts at P places, or what was looked at there."""
 
-    Attributes:
-        features: (N, P, channels) learned ones of each place.
-        spots: (N, P · QUARTERS, KNOWN) the known numbers of one spot of each quarter, place by place.
-    """
-
-    features: Tensor
+    features: Tensor  # (N, P, channels) learned ones of each place
+    # (N, P · QUARTERS, KNOWN) the known numbers of one spot of each quarter, place by place
     spots: Tensor
 
     def look(self, shares: Tensor) -> Tensor:

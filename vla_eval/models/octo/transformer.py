@@ -49,20 +49,13 @@ class TransformerSizes:
 
 
 class Window(NamedTuple):
-    """What the transformer reads.
+    """What the transformer reads."""
 
-    Attributes:
-        images: camera -> (B, W, 3, px, px) in levels [0, 255].
-        image_mask: camera -> (B, W), False where a camera gave no image.
-        step_mask: (B, W), False for steps before the episode began.
-        language_mask: (B,), False where there is none.
-    """
-
-    images: Mapping[str, Tensor]
-    image_mask: Mapping[str, Tensor]
-    step_mask: Tensor
+    images: Mapping[str, Tensor]  # camera -> (B, W, 3, px, px) in levels [0, 255]
+    image_mask: Mapping[str, Tensor]  # camera -> (B, W), False where a camera gave no image
+    step_mask: Tensor  # (B, W), False for steps before the episode began
     language_BLD: Tensor
-    language_mask: Tensor
+    language_mask: Tensor  # (B,), False where there is none
 
 
 class Outputs(NamedTuple):

@@ -25,18 +25,12 @@ BOUNDS: Mapping[str, tuple[float, float]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlgorithmRow:
-    """What has to be known of an algorithm before its network is made.
+    """What has to be known of an algorithm before its network is made."""
 
-    Attributes:
-        reads_rewards: it is more than imitation.
-        draws_actions: the actor is a distribution, whose mean acts.
-        has_value: there is a network of values in addition to those of action values.
-        has_targets: networks of action values follow slowly, for the right side of Bellman's equation.
-    """
-
-    reads_rewards: bool = True
-    draws_actions: bool = False
-    has_value: bool = False
+    reads_rewards: bool = True  # it is more than imitation
+    draws_actions: bool = False  # the actor is a distribution, whose mean acts
+    has_value: bool = False  # there is a network of values in addition to those of action values
+    # networks of action values follow slowly, for the right side of Bellman's equation
     has_targets: bool = True
 
 
@@ -54,46 +48,33 @@ class MikasaOfflineRLConfig(PortedConfig):
 
     A training sample is a transition: images of a frame and of the next one, action, reward, and whether the
     episode ends. Nothing is normalised by statistics: actions lie in [-1, 1].
-
-    Attributes:
-        masks_padding: there is none: one action per sample.
-        reads_state: the encoder of the paper's baselines has none.
-        algorithm: a name of `ALGORITHMS`.
-        reward: `dense`, `success` (1 in every step at which the success rule holds) or `sparse` (1 at the
-            first of them); None for an algorithm that reads none.
-        width: numbers that the encoder returns.
-        hidden: units of the two layers of actor and critics.
-        dropout: in these layers.
-        target_rate: share by which the slow critics follow in each step (Polyak averaging).
-        conservative_weight: of the conservative penalty of CQL.
-        n_sampled_actions: drawn for it from each of three distributions.
-        imitation_weight: of the squared distance between the actor's mean and the recorded action in CQL.
-        expectile: of the values of IQL; 0.5 is the mean.
-        advantage_scale: by how much better actions count more in the imitation of IQL.
-        scheduler_decay_steps, scheduler_decay_lr: cosine after the warm-up.
     """
 
-    masks_padding: ClassVar[bool] = True
-    reads_state: ClassVar[bool] = False
+    masks_padding: ClassVar[bool] = True  # there is none: one action per sample
+    reads_state: ClassVar[bool] = False  # the encoder of the paper's baselines has none
 
     chunk_size: int = 1
     n_action_steps: int = 1
 
-    algorithm: str = "iql"
+    algorithm: str = "iql"  # a name of `ALGORITHMS`
+    # `dense`, `success` (1 in every step at which the success rule holds) or `sparse` (1 at the first of
+    # them); None for an algorithm that reads none
     reward: str | None = "success"
-    width: int = 64
-    hidden: int = 256
-    dropout: float = 0.0
+    width: int = 64  # numbers that the encoder returns
+    hidden: int = 256  # units of the two layers of actor and critics
+    dropout: float = 0.0  # in these layers
     discount: float = 0.99
-    target_rate: float = 0.005
-    conservative_weight: float = 1.0
-    n_sampled_actions: int = 10
+    target_rate: float = 0.005  # share by which the slow critics follow in each step (Polyak averaging)
+    conservative_weight: float = 1.0  # of the conservative penalty of CQL
+    n_sampled_actions: int = 10  # drawn for it from each of three distributions
+    # of the squared distance between the actor's mean and the recorded action in CQL
     imitation_weight: float = 1.0
-    expectile: float = 0.7
-    advantage_scale: float = 3.0
+    expectile: float = 0.7  # of the values of IQL; 0.5 is the mean
+    advantage_scale: float = 3.0  # by how much better actions count more in the imitation of IQL
 
     optimizer_lr: float = 3e-4
     optimizer_weight_decay: float = 0.1
+    # `scheduler_decay_steps`, `scheduler_decay_lr`: cosine after the warm-up
     scheduler_decay_steps: int = 50_000
     scheduler_decay_lr: float = 3e-5
 

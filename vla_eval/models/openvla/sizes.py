@@ -61,19 +61,14 @@ class NetworkSizes(VisionSizes):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkOptions:
-    """What one model has in addition to its sizes.
+    """What one model has in addition to its sizes."""
 
-    Attributes:
-        head: `l1`: all actions of the chunk at once, continuous (OFT). `parallel_tokens`: at once, as
-            tokens (OFT without its head). `tokens`: one token after the other (OpenVLA as published).
-        chunk: actions of a chunk; a part of the architecture, it cannot be changed after training.
-        proprio: numbers of the proprioception; 0: the model has none.
-    """
-
+    # `l1`: all actions of the chunk at once, continuous (OFT). `parallel_tokens`: at once, as tokens
+    # (OFT without its head). `tokens`: one token after the other (OpenVLA as published).
     head: Head = "l1"
-    chunk: int = 8
+    chunk: int = 8  # actions of a chunk; a part of the architecture, it cannot be changed after training
     action: int = 7
-    proprio: int = 0
+    proprio: int = 0  # numbers of the proprioception; 0: the model has none
 
     @property
     def n_action_tokens(self) -> int:

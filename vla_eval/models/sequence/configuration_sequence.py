@@ -31,36 +31,26 @@ TYPE = "mikasa_sequence"
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
 class MikasaSequenceConfig(EpisodeConfig):
-    """A plain network: an encoder of images, a core over time, a head that predicts a chunk.
+    """A plain network: an encoder of images, a core over time, a head that predicts a chunk."""
 
-    Attributes:
-        core: what is kept from step to step, a name of `CORES`.
-        core_options: sizes of the core that differ from its row there.
-        encoder: of images, a name of `ENCODERS`.
-        head: a name of `HEADS`. `gated` reads the observation and the core's answer; `linear`, of the
-            sequence models' papers, reads the answer alone and bounds actions by tanh.
-        tokens: of a step, a name of `TOKENS`.
-        state_in_token: the token of an observation has the state in it, not only the images.
-        reward: whose return to go is a token, a `RewardKind`. None: no token needs one.
-        target_return: the return to go at inference, the same at every step. None: 1 for sparse rewards; for
-            others the highest return of the dataset's episodes.
-        width: units of a token, of the core and of the head.
-        heads: of its attention, where it has any.
-        context_steps: the steps, the newest among them, that a layer of a transformer sees; of cores that
-            read an episode in segments, the steps of one.
-    """
-
-    core: str = "gru"
+    core: str = "gru"  # what is kept from step to step, a name of `CORES`
+    # sizes of the core that differ from its row there
     core_options: dict[str, Any] = field(default_factory=dict)
-    encoder: str = "keypoints"
+    encoder: str = "keypoints"  # of images, a name of `ENCODERS`
+    # a name of `HEADS`. `gated` reads the observation and the core's answer; `linear`, of the sequence
+    # models' papers, reads the answer alone and bounds actions by tanh.
     head: str = "gated"
-    tokens: str = "step"
-    state_in_token: bool = True
-    reward: str | None = None
+    tokens: str = "step"  # of a step, a name of `TOKENS`
+    state_in_token: bool = True  # the token of an observation has the state in it, not only the images
+    reward: str | None = None  # whose return to go is a token, a `RewardKind`. None: no token needs one.
+    # the return to go at inference, the same at every step. None: 1 for sparse rewards; for others the
+    # highest return of the dataset's episodes.
     target_return: float | None = None
-    width: int = 256
+    width: int = 256  # units of a token, of the core and of the head
     layers: int = 1
-    heads: int = 4
+    heads: int = 4  # of its attention, where it has any
+    # the steps, the newest among them, that a layer of a transformer sees; of cores that read an episode
+    # in segments, the steps of one
     context_steps: int = 200
     dropout: float = 0.0
 

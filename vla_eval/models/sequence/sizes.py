@@ -39,25 +39,17 @@ class RecurrentOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransformerXLOptions:
-    """Sizes of Decision Transformer, RATE and GTrXL beyond those of every core.
-
-    Attributes:
-        inner_width: of the feed-forward layers; 0: there are none.
-        cached_tokens: hidden states of earlier segments that are kept.
-        memory_tokens: that a segment reads at its beginning and writes at its end.
-        valve_heads: of the attention between old memory tokens and what was written; 0: there is no valve.
-        carries_gradient: whether later segments teach a segment what to write.
-        gated: GTrXL's gates instead of sums.
-    """
+    """Sizes of Decision Transformer, RATE and GTrXL beyond those of every core."""
 
     head_width: int = 128
-    inner_width: int = 64
+    inner_width: int = 64  # of the feed-forward layers; 0: there are none
     attention_dropout: float = 0.2
-    cached_tokens: int = 0
-    memory_tokens: int = 0
+    cached_tokens: int = 0  # hidden states of earlier segments that are kept
+    memory_tokens: int = 0  # that a segment reads at its beginning and writes at its end
+    # of the attention between old memory tokens and what was written; 0: there is no valve
     valve_heads: int = 0
-    carries_gradient: bool = True
-    gated: bool = False
+    carries_gradient: bool = True  # whether later segments teach a segment what to write
+    gated: bool = False  # GTrXL's gates instead of sums
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -72,17 +64,11 @@ class TransformerXLOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MambaOptions:
-    """Sizes of Mamba's blocks: Gu and Dao 2023, "Mamba", section 3.4.
+    """Sizes of Mamba's blocks: Gu and Dao 2023, "Mamba", section 3.4."""
 
-    Attributes:
-        state: numbers that are kept of each unit.
-        convolved: tokens that the short convolution reads.
-        expand: units of a block, in widths.
-    """
-
-    state: int = 16
-    convolved: int = 4
-    expand: int = 2
+    state: int = 16  # numbers that are kept of each unit
+    convolved: int = 4  # tokens that the short convolution reads
+    expand: int = 2  # units of a block, in widths
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -91,26 +77,17 @@ class MambaOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ElmurOptions:
-    """Sizes of ELMUR beyond those of every core.
+    """Sizes of ELMUR beyond those of every core."""
 
-    Attributes:
-        slots: of each layer's memory; a segment writes one.
-        blend: share of what is new in a slot that is written again.
-        slot_scale: standard deviation of what slots hold before they are written.
-        experts: each token is sent to one of them, and to the one for all.
-        longest: distances in tokens beyond this count as this.
-        carries_gradient: whether later segments teach a segment what to write.
-    """
-
-    slots: int = 256
-    blend: float = 0.407
-    slot_scale: float = 0.1
-    experts: int = 16
+    slots: int = 256  # of each layer's memory; a segment writes one
+    blend: float = 0.407  # share of what is new in a slot that is written again
+    slot_scale: float = 0.1  # standard deviation of what slots hold before they are written
+    experts: int = 16  # each token is sent to one of them, and to the one for all
     inner_width: int = 128
     attention_dropout: float = 0.3
     memory_dropout: float = 0.055
-    longest: int = 1024
-    carries_gradient: bool = True
+    longest: int = 1024  # distances in tokens beyond this count as this
+    carries_gradient: bool = True  # whether later segments teach a segment what to write
 
     def __post_init__(self) -> None:
         """Check the ranges."""
@@ -124,20 +101,14 @@ CoreOptions = NoOptions | RecurrentOptions | TransformerXLOptions | MambaOptions
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoreRow:
-    """What has to be known of a core before it is made.
+    """What has to be known of a core before it is made."""
 
-    Attributes:
-        remembers: False: each step is answered alone, and the policy is shown only the last frame.
-        heads_divide: its heads divide the width.
-        is_even: the width is even, half of it for sines and half for cosines.
-        options: its other sizes, as they are if a recipe says nothing.
-        fixed: which of them make the core what it is, so that a recipe may not set them.
-    """
-
+    # False: each step is answered alone, and the policy is shown only the last frame
     remembers: bool = True
-    heads_divide: bool = False
-    is_even: bool = False
-    options: CoreOptions = NoOptions()
+    heads_divide: bool = False  # its heads divide the width
+    is_even: bool = False  # the width is even, half of it for sines and half for cosines
+    options: CoreOptions = NoOptions()  # its other sizes, as they are if a recipe says nothing
+    # which of them make the core what it is, so that a recipe may not set them
     fixed: tuple[str, ...] = ()
 
 

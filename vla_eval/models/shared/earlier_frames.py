@@ -19,14 +19,10 @@ SEGMENT_PADDING_KEY = "segment_is_pad"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Segments:
-    """The frames of an episode at which its memory tokens are written, for training.
+    """The frames of an episode at which its memory tokens are written, for training."""
 
-    Attributes:
-        stride: control steps between them, from the first frame on.
-        n_segments: of a sample, the frame itself among them; shorter ones are padded at their beginning.
-    """
-
-    stride: int
+    stride: int  # control steps between them, from the first frame on
+    # of a sample, the frame itself among them; shorter ones are padded at their beginning
     n_segments: int
 
     def numbers(self, newest: int) -> list[int]:
@@ -36,17 +32,11 @@ class Segments:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleMemory:
-    """What a training sample has in addition to its own frame.
+    """What a training sample has in addition to its own frame."""
 
-    Attributes:
-        choice: of earlier frames; None: none are shown.
-        cameras: fields of the dataset of which they are shown; a rule looks at the first.
-        segments: None: a sample is one frame.
-    """
-
-    choice: FrameChoice | None
-    cameras: tuple[str, ...]
-    segments: Segments | None
+    choice: FrameChoice | None  # of earlier frames; None: none are shown
+    cameras: tuple[str, ...]  # fields of the dataset of which they are shown; a rule looks at the first
+    segments: Segments | None  # None: a sample is one frame
 
 
 def place_field(camera: str, place: int) -> str:
@@ -75,18 +65,12 @@ def in_places(camera: str, images: Sequence[Tensor | None], like: Tensor) -> Ite
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameMemory:
-    """The earlier frames of one running episode; of constant size.
+    """The earlier frames of one running episode; of constant size."""
 
-    Attributes:
-        choice: see there.
-        cameras: fields of which images are kept; the rule looks at the first.
-        seen: what the rule keeps.
-        images: number of a frame -> its images by field, float32 in [0, 1]; those that may be shown.
-    """
-
-    choice: FrameChoice
-    cameras: tuple[str, ...]
-    seen: Seen = field(default_factory=Seen)
+    choice: FrameChoice  # see there
+    cameras: tuple[str, ...]  # fields of which images are kept; the rule looks at the first
+    seen: Seen = field(default_factory=Seen)  # what the rule keeps
+    # number of a frame -> its images by field, float32 in [0, 1]; those that may be shown
     images: Mapping[int, Mapping[str, Tensor]] = field(default_factory=dict)
 
     def after(self, frame: Mapping[str, Tensor]) -> "FrameMemory":

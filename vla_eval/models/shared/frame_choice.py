@@ -42,19 +42,12 @@ class Seen:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameChoice:
-    """A rule and its numbers.
+    """A rule and its numbers."""
 
-    Attributes:
-        rule: a name of `RULES`.
-        n_places: so many frames are shown at most.
-        stride: of the rule `last`: control steps between them.
-        least_novelty: of the rule `keyframes`: a smaller change is not an event; see `novelty`.
-    """
-
-    rule: str
-    n_places: int
-    stride: int
-    least_novelty: float
+    rule: str  # a name of `RULES`
+    n_places: int  # so many frames are shown at most
+    stride: int  # of the rule `last`: control steps between them
+    least_novelty: float  # of the rule `keyframes`: a smaller change is not an event; see `novelty`
 
     def __post_init__(self) -> None:
         check_names("rule", [self.rule], RULES, where="policy.memory_rule")

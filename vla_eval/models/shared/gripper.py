@@ -51,17 +51,11 @@ DECODINGS: tuple[GripperDecoding, ...] = ("continuous", "binary", "paper_openvla
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gripper:
-    """How a policy encodes the gripper, and how what it predicts is executed.
+    """How a policy encodes the gripper, and how what it predicts is executed."""
 
-    Attributes:
-        encoding: of the policy.
-        decoding: from the policy to the environment.
-        dim: which dimension of the action is the gripper; -1 is the last.
-    """
-
-    encoding: GripperEncoding = "maniskill"
-    decoding: GripperDecoding = "continuous"
-    dim: int = -1
+    encoding: GripperEncoding = "maniskill"  # of the policy
+    decoding: GripperDecoding = "continuous"  # from the policy to the environment
+    dim: int = -1  # which dimension of the action is the gripper; -1 is the last
 
     def __post_init__(self) -> None:
         """Check the names, and that the faithful mode is used as the paper's code uses it."""

@@ -172,22 +172,16 @@ class Augmentation:
     """Random changes of training images; one draw per sample and camera, alike for all its frames.
 
     Applied in this order. A value at which nothing changes switches that change off.
-
-    Attributes:
-        crop_area: least and largest share of the area that is kept; None: no crop.
-        crop_ratio: least and largest width / height of the crop.
-        brightness: up to so much is added, of the range 1.
-        contrast: least and largest factor about each image's mean, per colour.
-        saturation: least and largest factor.
-        hue: turned by up to so much of a full circle.
     """
 
+    # least and largest share of the area that is kept; None: no crop
     crop_area: tuple[float, float] | None = None
-    crop_ratio: tuple[float, float] = (1.0, 1.0)
-    brightness: float = 0.0
+    crop_ratio: tuple[float, float] = (1.0, 1.0)  # least and largest width / height of the crop
+    brightness: float = 0.0  # up to so much is added, of the range 1
+    # least and largest factor about each image's mean, per colour
     contrast: tuple[float, float] = (1.0, 1.0)
-    saturation: tuple[float, float] = (1.0, 1.0)
-    hue: float = 0.0
+    saturation: tuple[float, float] = (1.0, 1.0)  # least and largest factor
+    hue: float = 0.0  # turned by up to so much of a full circle
 
     @property
     def centre_area(self) -> float:

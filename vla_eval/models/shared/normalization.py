@@ -29,19 +29,13 @@ EPSILON = 1e-8  # added to what is divided by, in all of the originals
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Normalization:
-    """How one field is normalised.
+    """How one field is normalised."""
 
-    Attributes:
-        kind: `mean_std`: (x - mean) / std. `q01_q99`: the range between these quantiles becomes [-1, 1].
-        mask: for each dimension whether it is normalised; others are left as they are.
-        clip: cut to [-1, 1] after normalising; only with `q01_q99`.
-        clip_unmasked: cut dimensions that are left as they are, too.
-    """
-
+    # `mean_std`: (x - mean) / std. `q01_q99`: the range between these quantiles becomes [-1, 1].
     kind: NormalizationKind
-    mask: tuple[bool, ...]
-    clip: bool = False
-    clip_unmasked: bool = False
+    mask: tuple[bool, ...]  # for each dimension whether it is normalised; others are left as they are
+    clip: bool = False  # cut to [-1, 1] after normalising; only with `q01_q99`
+    clip_unmasked: bool = False  # cut dimensions that are left as they are, too
 
     def __post_init__(self) -> None:
         if self.kind not in STATISTICS:

@@ -9,19 +9,12 @@ YES_NO = {"yes": True, "no": False}
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class Flag:
-    """How a field is typed.
+    """How a field is typed."""
 
-    Attributes:
-        name: of the flag.
-        settings: argparse's, its help among them.
-        values: what may be typed -> what it means; empty: what is typed is the value.
-        former: an earlier name of the flag.
-    """
-
-    name: str
-    settings: Mapping[str, Any]
-    values: Mapping[str, Any]
-    former: str = ""
+    name: str  # of the flag
+    settings: Mapping[str, Any]  # argparse's, its help among them
+    values: Mapping[str, Any]  # what may be typed -> what it means; empty: what is typed is the value
+    former: str = ""  # an earlier name of the flag
 
 
 def option(

@@ -24,20 +24,15 @@ Statistics = dict[str, dict[str, Any]]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Original:
-    """What a converter has found.
-
-    Attributes:
-        weights: function from the policy, without values, to its tensors by name.
-        make_processors: makes pre- and postprocessor from the configuration.
-        casts: whether types of numbers may differ from the configuration's.
-        check_tokenizer: is given the tokenizer, whose files are copied, and raises if it is not the model's;
-            None: the configuration names the tokenizer.
-    """
+    """What a converter has found."""
 
     config: Any
+    # function from the policy, without values, to its tensors by name
     weights: Callable[[Any], Mapping[str, Tensor]]
-    make_processors: Callable[[], tuple[Any, Any]]
-    casts: bool = False
+    make_processors: Callable[[], tuple[Any, Any]]  # makes pre- and postprocessor from the configuration
+    casts: bool = False  # whether types of numbers may differ from the configuration's
+    # is given the tokenizer, whose files are copied, and raises if it is not the model's; None: the
+    # configuration names the tokenizer
     check_tokenizer: Callable[[Any], None] | None = None
 
 

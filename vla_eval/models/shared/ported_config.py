@@ -20,23 +20,18 @@ from vla_eval.strict.bounds import require
 
 @dataclass
 class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
-    """A policy that predicts chunks and is trained with AdamW.
+    """A policy that predicts chunks and is trained with AdamW."""
 
-    Attributes:
-        chunk_size: actions of a chunk.
-        n_action_steps: how many lerobot's own loop executes, the first ones; ours sets its own number.
-        scheduler_warmup_steps: over which the learning rate rises from 0.
-        normalization_mapping: of lerobot's own normaliser, which none of these policies uses.
-    """
-
-    chunk_size: int = 8
+    chunk_size: int = 8  # actions of a chunk
+    # how many lerobot's own loop executes, the first ones; ours sets its own number
     n_action_steps: int = 8
 
     optimizer_lr: float = 5e-4
     optimizer_weight_decay: float = 0.01
     optimizer_grad_clip_norm: float = 1.0
-    scheduler_warmup_steps: int = 0
+    scheduler_warmup_steps: int = 0  # over which the learning rate rises from 0
 
+    # of lerobot's own normaliser, which none of these policies uses
     normalization_mapping: dict[str, NormalizationMode] = field(
         default_factory=lambda: dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
     )
@@ -82,29 +77,20 @@ class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untype
 
 @dataclass
 class PromptedConfig(PortedConfig):
-    """A policy whose language model reads images and a prompt: one frame in, one chunk out.
+    """A policy whose language model reads images and a prompt: one frame in, one chunk out."""
 
-    Attributes:
-        pictures: fields of the images that are read, in this order.
-        sizes: sizes that differ from the published model's, see the policy's `NetworkSizes`.
-        dtype: of the network: `float32`, `bfloat16`.
-        gradient_checkpointing: recompute activations in the backward pass.
-        do_mask_loss_for_padding: leave actions beyond an episode's end out of the loss. False: chunks that
-            have any are refused.
-        drop_n_last_frames: set by `__post_init__` for that; lerobot's sampler reads it.
-        tokenizer_name: folder or name of the tokenizer; `bytes`: see `steps.byte_tokenizer`.
-        prompt_max_tokens: a longer prompt is an error.
-    """
-
+    # fields of the images that are read, in this order
     pictures: list[str] = field(default_factory=list)
+    # sizes that differ from the published model's, see the policy's `NetworkSizes`
     sizes: dict[str, int] = field(default_factory=dict)
-    dtype: str = "bfloat16"
-    gradient_checkpointing: bool = False
+    dtype: str = "bfloat16"  # of the network: `float32`, `bfloat16`
+    gradient_checkpointing: bool = False  # recompute activations in the backward pass
     gripper: str = "maniskill"
+    # leave actions beyond an episode's end out of the loss. False: chunks that have any are refused.
     do_mask_loss_for_padding: bool = False
-    drop_n_last_frames: int = 0
-    tokenizer_name: str = ""
-    prompt_max_tokens: int = 256
+    drop_n_last_frames: int = 0  # set by `__post_init__` for that; lerobot's sampler reads it
+    tokenizer_name: str = ""  # folder or name of the tokenizer; `bytes`: see `steps.byte_tokenizer`
+    prompt_max_tokens: int = 256  # a longer prompt is an error
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -24,21 +24,14 @@ def quoted(sentence: str) -> str:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SentenceReading:
-    """What a policy's network is given of a sentence.
+    """What a policy's network is given of a sentence."""
 
-    Attributes:
-        sentence: as the policy was asked.
-        ids: the tokens that the network gets, with those that the policy puts around the sentence.
-        n_tokens: how many there would be without a limit.
-        limit: how many are read at most; None: all.
-        kept: the text of `ids`.
-    """
-
-    sentence: str
+    sentence: str  # as the policy was asked
+    # the tokens that the network gets, with those that the policy puts around the sentence
     ids: tuple[int, ...]
-    n_tokens: int
-    limit: int | None
-    kept: str
+    n_tokens: int  # how many there would be without a limit
+    limit: int | None  # how many are read at most; None: all
+    kept: str  # the text of `ids`
 
     def to_wire(self) -> dict[str, Any]:
         """Return it as a server sends it: without the sentence, which its client knows."""

@@ -36,18 +36,12 @@ FIRST_PLACE = 1
 
 
 class Inputs(NamedTuple):
-    """The inputs of B samples.
+    """The inputs of B samples."""
 
-    Attributes:
-        images: (B, C, 3, H, W) in [0, 1].
-        intrinsics: (B, C, 3, 3) of the cameras, for images of that size.
-        prompts: see there.
-        depth: (B, C, h, w) metres, of the padded images; None: the network's depth model is asked.
-    """
-
-    images: Tensor
-    intrinsics: Tensor
-    prompts: Prompts
+    images: Tensor  # (B, C, 3, H, W) in [0, 1]
+    intrinsics: Tensor  # (B, C, 3, 3) of the cameras, for images of that size
+    prompts: Prompts  # see there
+    # (B, C, h, w) metres, of the padded images; None: the network's depth model is asked
     depth: Tensor | None = None
 
 

@@ -27,30 +27,22 @@ BOUNDS = {
 
 @dataclass
 class VlaMemoryConfig:
-    """Memory of a VLA that reads one frame: earlier frames as further images, and recurrent tokens.
-
-    Attributes:
-        memory_places: further images of each camera at most; 0: none.
-        memory_rule: which frames they are, a name of `frame_choice.RULES`.
-        memory_stride: of the rule `last`: control steps between them.
-        memory_novelty: of the rule `keyframes`: a smaller change of the image is not an event.
-        memory_cameras: of which cameras, by the dataset's names; the rule looks at the first.
-        memory_tokens: that are carried from inference to inference; 0: none.
-        token_stride: control steps between two writings of them, the first frame being one.
-        token_segments: writings through which a loss is propagated back, the frame itself among them.
-        window_steps: length of the longest episode in training, with tokens; our `finetune` sets it.
-    """
+    """Memory of a VLA that reads one frame: earlier frames as further images, and recurrent tokens."""
 
     masks_padding: ClassVar[bool]
 
-    memory_places: int = 0
-    memory_rule: str = "last"
-    memory_stride: int = 8
+    memory_places: int = 0  # further images of each camera at most; 0: none
+    memory_rule: str = "last"  # which frames they are, a name of `frame_choice.RULES`
+    memory_stride: int = 8  # of the rule `last`: control steps between them
+    # of the rule `keyframes`: a smaller change of the image is not an event
     memory_novelty: float = 0.08
+    # of which cameras, by the dataset's names; the rule looks at the first
     memory_cameras: list[str] = field(default_factory=lambda: [next(iter(CAMERA_KEYS.values()))])
-    memory_tokens: int = 0
-    token_stride: int = 8
+    memory_tokens: int = 0  # that are carried from inference to inference; 0: none
+    token_stride: int = 8  # control steps between two writings of them, the first frame being one
+    # writings through which a loss is propagated back, the frame itself among them
     token_segments: int = 8
+    # length of the longest episode in training, with tokens; our `finetune` sets it
     window_steps: int | None = None
 
     def __post_init__(self) -> None:

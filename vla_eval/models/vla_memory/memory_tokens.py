@@ -18,17 +18,11 @@ KEPT_AT_FIRST = 1.0  # bias of the gate: 0.73 of a token is kept by a writing be
 
 
 class TokenMemory(NamedTuple):
-    """What B episodes remember.
+    """What B episodes remember."""
 
-    Attributes:
-        n_shown: (B,) frames so far.
-        read: (B, tokens, width) as an inference at the newest frame reads them: written before it.
-        written: (B, tokens, width) as later frames read them.
-    """
-
-    n_shown: Tensor
-    read: Tensor
-    written: Tensor
+    n_shown: Tensor  # (B,) frames so far
+    read: Tensor  # (B, tokens, width) as an inference at the newest frame reads them: written before it
+    written: Tensor  # (B, tokens, width) as later frames read them
 
 
 class MemoryTokens(nn.Module):

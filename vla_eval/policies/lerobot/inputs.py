@@ -33,15 +33,11 @@ MAX_FOV_DIFFERENCE_RAD = 1e-4
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputMap:
-    """How an observation becomes what the preprocessor takes.
+    """How an observation becomes what the preprocessor takes."""
 
-    Attributes:
-        cameras: camera of the environment -> field, as the dataset named it, in the policy's order.
-        state: which proprioception `observation.state` is; None for a policy without any.
-    """
-
+    # camera of the environment -> field, as the dataset named it, in the policy's order
     cameras: Mapping[str, str]
-    state: StateKind | None
+    state: StateKind | None  # which proprioception `observation.state` is; None for a policy without any
 
     def tensors(self, observation: Observation) -> dict[str, Tensor]:
         """Return images (3, H, W) float32 in [0, 1] and state (D,) float32, by field.
@@ -64,16 +60,11 @@ class InputMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputOptions:
-    """The recipe's fields about inputs.
+    """The recipe's fields about inputs."""
 
-    Attributes:
-        cameras: camera of the environment -> field of the dataset.
-        state: which proprioception; None: the one with that number of dimensions.
-        absent_cameras: fields of the policy that are left out on purpose; only for policies that mask them.
-    """
-
-    cameras: Mapping[str, str]
-    state: StateKind | None
+    cameras: Mapping[str, str]  # camera of the environment -> field of the dataset
+    state: StateKind | None  # which proprioception; None: the one with that number of dimensions
+    # fields of the policy that are left out on purpose; only for policies that mask them
     absent_cameras: Sequence[str]
 
 

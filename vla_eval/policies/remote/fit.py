@@ -25,21 +25,14 @@ MAX_HZ_DIFFERENCE = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """How observations become requests.
+    """How observations become requests."""
 
-    Attributes:
-        cameras: camera of the environment -> how it is sent, with its size.
-        state: key -> layout.
-        state_dims: state of the environment -> names of its numbers.
-        reads: which frames the server must see.
-    """
-
-    cameras: Mapping[str, CameraSettings]
-    state: Mapping[str, StateLayout]
-    state_dims: Mapping[str, tuple[str, ...]]
+    cameras: Mapping[str, CameraSettings]  # camera of the environment -> how it is sent, with its size
+    state: Mapping[str, StateLayout]  # key -> layout
+    state_dims: Mapping[str, tuple[str, ...]]  # state of the environment -> names of its numbers
     prompt_key: str
     chunk_size: int
-    reads: Literal["last", "every"]
+    reads: Literal["last", "every"]  # which frames the server must see
 
     @property
     def states(self) -> tuple[str, ...]:

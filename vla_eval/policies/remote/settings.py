@@ -41,19 +41,14 @@ class CameraSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionSettings:
-    """What the server's actions mean, where it is something else than at this environment.
+    """What the server's actions mean, where it is something else than at this environment."""
 
-    Attributes:
-        gripper: which value of the last number opens and closes.
-        rotation: how the second three numbers describe a turn.
-        position_unit_m: what 1 means in the first three numbers; None: as here.
-        rotation_unit_rad: what 1 means in the second three; None: as here.
-    """
-
+    # which value of the last number opens and closes
     gripper: Literal["open_positive", "close_positive", "open_01", "close_01"] = "open_positive"
+    # how the second three numbers describe a turn
     rotation: Literal["euler_xyz", "axis_angle"] = "euler_xyz"
-    position_unit_m: float | None = None
-    rotation_unit_rad: float | None = None
+    position_unit_m: float | None = None  # what 1 means in the first three numbers; None: as here
+    rotation_unit_rad: float | None = None  # what 1 means in the second three; None: as here
 
     def __post_init__(self) -> None:
         bounds = {"position_unit_m": (1e-4, 10.0), "rotation_unit_rad": (1e-4, 10.0)}
@@ -69,33 +64,23 @@ class ActionSettings:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteSettings:
-    """The arguments of the adapter `remote`; `docs/remote.md` has the table.
+    """The arguments of the adapter `remote`; `docs/remote.md` has the table."""
 
-    Attributes:
-        url: `ws://HOST:PORT`; several with commas are servers of the same policy.
-        dialect: `openpi`, or `vla_eval` for the model servers of allenai's vla-evaluation-harness.
-        cameras: our name of a camera -> how it is sent; None: as the server says.
-        state: key in a request -> layout; None: as the server says. Empty: no state is sent.
-        prompt_key: key of the instruction; None: as the server says, else `prompt`.
-        chunk_size: actions of one reply; None: as the server says.
-        reads: whether the policy must see each control step; None: as the server says.
-        actions: what the server's actions mean; None: the same as here.
-        timeout_seconds: how long a reply is waited for.
-        connect_seconds: how long a worker waits for a server that does not listen yet.
-        api_key_env: the environment variable with the API key.
-    """
-
-    url: str
+    url: str  # `ws://HOST:PORT`; several with commas are servers of the same policy
+    # `openpi`, or `vla_eval` for the model servers of allenai's vla-evaluation-harness
     dialect: Dialect = "openpi"
+    # our name of a camera -> how it is sent; None: as the server says
     cameras: dict[str, CameraSettings] | None = None
+    # key in a request -> layout; None: as the server says. Empty: no state is sent.
     state: dict[str, str] | None = None
-    prompt_key: str | None = None
-    chunk_size: int | None = None
+    prompt_key: str | None = None  # key of the instruction; None: as the server says, else `prompt`
+    chunk_size: int | None = None  # actions of one reply; None: as the server says
+    # whether the policy must see each control step; None: as the server says
     reads: Literal["last", "every"] | None = None
-    actions: ActionSettings | None = None
-    timeout_seconds: float = 120.0
-    connect_seconds: float = 30.0
-    api_key_env: str | None = None
+    actions: ActionSettings | None = None  # what the server's actions mean; None: the same as here
+    timeout_seconds: float = 120.0  # how long a reply is waited for
+    connect_seconds: float = 30.0  # how long a worker waits for a server that does not listen yet
+    api_key_env: str | None = None  # the environment variable with the API key
 
     def __post_init__(self) -> None:
         check_bounds(

@@ -53,35 +53,25 @@ class Board:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublishedResult:
-    """One method as one source reports it. None, or nothing, is what the source does not state.
-
-    Attributes:
-        source: key of `Published.sources`; where: the place in it.
-        board: key of `Published.boards`.
-        training: one model per task, or one for all tasks.
-        spread: which spread the rates have.
-        mean: as the source states it.
-        differs: what is known to differ from the protocol or from other rows.
-        contested: task -> what contradicts its rate.
-    """
+    """One method as one source reports it. None, or nothing, is what the source does not state."""
 
     method: str
     family: str
-    source: str
-    board: str
+    source: str  # key of `Published.sources`; where: the place in it
+    board: str  # key of `Published.boards`
     where: str | None = None
     control_mode: str | None = None
     image_px: int | None = None
     n_action_steps: int | None = None
-    training: str | None = None
+    training: str | None = None  # one model per task, or one for all tasks
     runs: int | None = None
     episodes: int | None = None
     seeds: str | None = None
-    spread: str | None = None
+    spread: str | None = None  # which spread the rates have
     rates: dict[str, PublishedRate] = field(default_factory=dict)
-    mean: PublishedRate | None = None
-    differs: tuple[str, ...] = ()
-    contested: dict[str, str] = field(default_factory=dict)
+    mean: PublishedRate | None = None  # as the source states it
+    differs: tuple[str, ...] = ()  # what is known to differ from the protocol or from other rows
+    contested: dict[str, str] = field(default_factory=dict)  # task -> what contradicts its rate
     is_measured_here: bool = False
 
     @property

@@ -25,21 +25,14 @@ WRIST_MESH_ROBOTS: dict[WristMesh, str] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arm:
-    """What a task needs to know about an arm.
+    """What a task needs to know about an arm."""
 
-    Attributes:
-        joints: names of the entries of `qpos`; the last two are the fingers.
-        arm_joints: indices of those that move the hand.
-        rest_qpos: joint positions at the start of an episode, without noise; rad, and m for prismatic joints.
-        base_m: position of the root, world frame.
-        control_modes: those that it takes.
-    """
-
-    joints: tuple[str, ...]
-    arm_joints: tuple[int, ...]
+    joints: tuple[str, ...]  # names of the entries of `qpos`; the last two are the fingers
+    arm_joints: tuple[int, ...]  # indices of those that move the hand
+    # joint positions at the start of an episode, without noise; rad, and m for prismatic joints
     rest_qpos: tuple[float, ...]
-    base_m: tuple[float, float, float]
-    control_modes: tuple[str, ...] = (EE_DELTA_POSE,)
+    base_m: tuple[float, float, float]  # position of the root, world frame
+    control_modes: tuple[str, ...] = (EE_DELTA_POSE,)  # those that it takes
 
 
 # Arm of the official code (mikasa_tasks section 1): tool centre point at (-0.07, 0, 0.318), pointing down.

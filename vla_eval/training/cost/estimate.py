@@ -25,21 +25,15 @@ TERA = 1e12
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """What a fine-tuning takes.
+    """What a fine-tuning takes."""
 
-    Attributes:
-        model: its parameters and the memory for weights, gradients and optimizer.
-        cost: of a sample; None for a type of policy whose tokens are not known.
-        steps, batch_size, micro_batch_size: of the recipe; the last is what passes through at once.
-        tflops: assumed rate of the device, 10^12 operations per second.
-    """
-
-    model: ModelDescription
-    cost: SampleCost | None
+    model: ModelDescription  # its parameters and the memory for weights, gradients and optimizer
+    cost: SampleCost | None  # of a sample; None for a type of policy whose tokens are not known
+    # `steps`, `batch_size`, `micro_batch_size`: of the recipe; the last is what passes through at once
     steps: int
     batch_size: int
     micro_batch_size: int
-    tflops: float
+    tflops: float  # assumed rate of the device, 10^12 operations per second
 
     @property
     def fixed_bytes(self) -> int:

@@ -28,32 +28,20 @@ LAYER = re.compile(r"(.*\.(?:layers|layer|blocks|block)\.\d+)\.")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SampleCost:
-    """What a sample costs.
+    """What a sample costs."""
 
-    Attributes:
-        inference_operations: of one forward pass, without repeated denoising or decoding.
-        inference_bytes: what the linear layers of the largest layer read and write in it.
-        step_operations: of forward and backward pass, what is computed again included.
-        saved_bytes: kept for the backward pass, and what the largest linear layer reads and writes.
-    """
-
-    inference_operations: float
-    inference_bytes: float
-    step_operations: float
-    saved_bytes: float
+    inference_operations: float  # of one forward pass, without repeated denoising or decoding
+    inference_bytes: float  # what the linear layers of the largest layer read and write in it
+    step_operations: float  # of forward and backward pass, what is computed again included
+    saved_bytes: float  # kept for the backward pass, and what the largest linear layer reads and writes
 
 
 class Layer(NamedTuple):
-    """A layer that multiplies by a matrix.
+    """A layer that multiplies by a matrix."""
 
-    Attributes:
-        name: of the module.
-        weight: its matrix.
-        n_read, n_written: numbers per token, or per place of its output.
-    """
-
-    name: str
-    weight: Tensor
+    name: str  # of the module
+    weight: Tensor  # its matrix
+    # `n_read`, `n_written`: numbers per token, or per place of its output
     n_read: int
     n_written: int
 

@@ -25,18 +25,12 @@ OWN_VARIABLES = "MIKASA_VLA_"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """What an actor takes over from the driver.
+    """What an actor takes over from the driver."""
 
-    Attributes:
-        folder: the driver's working directory, which relative paths in jobs begin at.
-        path: where it imports from, for a policy's own module.
-        logs: the driver's folder of logs; used where the storage is shared.
-    """
-
-    folder: str
+    folder: str  # the driver's working directory, which relative paths in jobs begin at
     variables: Mapping[str, str]
-    path: tuple[str, ...]
-    logs: str
+    path: tuple[str, ...]  # where it imports from, for a policy's own module
+    logs: str  # the driver's folder of logs; used where the storage is shared
 
     def enter(self, address: str) -> Path:
         """Take it over on the machine with this address; return the folder of logs."""

@@ -34,37 +34,26 @@ class BusyService(Protocol):
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class Machine:
-    """One machine.
+    """One machine."""
 
-    Attributes:
-        node: its id in the cluster.
-        n_cores, n_gpus: what the cluster may use of it.
-        facts: its facts; None: it has not answered yet.
-        refused: why it is not used; empty: it is.
-        is_alive: whether the cluster has it.
-        was_sent: whether folders that it did not have were sent to it.
-        kind: what kind it is; None: the same as the planning machine.
-        n_errors_in_a_row: workers that died and jobs that failed since its last answer.
-        seen_at: `time.monotonic` when it came.
-        name, n_running, n_done: see `MachineLoad`.
-    """
-
-    node: str
+    node: str  # its id in the cluster
+    # `name`, `n_running`, `n_done`: see `MachineLoad`
     name: str
     address: str
+    # `n_cores`, `n_gpus`: what the cluster may use of it
     n_cores: int
     n_gpus: int
-    facts: NodeFacts | None = None
-    refused: tuple[str, ...] = ()
-    is_alive: bool = True
-    was_sent: bool = False
-    kind: MachineKind | None = None
+    facts: NodeFacts | None = None  # its facts; None: it has not answered yet
+    refused: tuple[str, ...] = ()  # why it is not used; empty: it is
+    is_alive: bool = True  # whether the cluster has it
+    was_sent: bool = False  # whether folders that it did not have were sent to it
+    kind: MachineKind | None = None  # what kind it is; None: the same as the planning machine
     n_used: int = 0
     n_running: int = 0
     n_done: int = 0
-    n_errors_in_a_row: int = 0
+    n_errors_in_a_row: int = 0  # workers that died and jobs that failed since its last answer
     services: list[BusyService] = field(default_factory=list)
-    seen_at: float = field(default_factory=time.monotonic)
+    seen_at: float = field(default_factory=time.monotonic)  # `time.monotonic` when it came
 
     @property
     def is_usable(self) -> bool:

@@ -23,22 +23,16 @@ GB = 1e9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeFacts:
-    """What there is on a machine.
+    """What there is on a machine."""
 
-    Attributes:
-        environment: commit, package versions, CPU, drivers; see `collect_environment`.
-        n_gpus: GPUs with a driver.
-        missing: what is wrong with the files that it was asked for.
-        absent: folders that it was asked for, does not have, and can be sent.
-        recipes: `policies/act` -> sha256, of the recipes of its package.
-    """
-
+    # commit, package versions, CPU, drivers; see `collect_environment`
     environment: Mapping[str, JsonValue]
     vulkan: tuple[str, ...]
     free_bytes: int
-    n_gpus: int
-    missing: tuple[str, ...] = ()
-    absent: tuple[str, ...] = ()
+    n_gpus: int  # GPUs with a driver
+    missing: tuple[str, ...] = ()  # what is wrong with the files that it was asked for
+    absent: tuple[str, ...] = ()  # folders that it was asked for, does not have, and can be sent
+    # `policies/act` -> sha256, of the recipes of its package
     recipes: Mapping[str, JsonValue] = field(default_factory=dict)
 
     @property
