@@ -69,9 +69,6 @@ def load_processor(
 
     `overrides`: step's name -> arguments that replace the saved ones; they are ours, and not checked. The
     other arguments are lerobot's of a `DataProcessorPipeline`.
-
-    Raises:
-        CheckpointError: the file is damaged, or names code, files or settings that it may not.
     """
     saved = read_saved_processor(path)
     classes = [resolve_step(step) for step in saved.steps]  # all of them, before the first is called

@@ -66,9 +66,6 @@ def check_structure(folder: Path) -> str:
 
     A base needs no statistics: a fine-tuning gives it those of its dataset. Types may differ from the
     configuration's, since a recipe chooses the precision.
-
-    Raises:
-        CheckpointError: the configuration is refused, or tensors are missing, unexpected or of another shape.
     """
     config = read_config(folder, LoadOptions(device="cpu"))
     policy = make_unfilled_policy(config, where=folder)

@@ -56,11 +56,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the controls, then print the audit to standard output; everything else goes to standard error.
-
-    Raises:
-        VlaEvalError: a mistyped task, a run folder of other settings, or a fault of every episode.
-    """
+    """Run the controls, then print the audit to standard output; everything else goes to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.audit.audit_text import render_audit
     from vla_eval.audit.evaluations import read_audit

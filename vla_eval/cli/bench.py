@@ -92,11 +92,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _look_for(args: argparse.Namespace) -> None:
-    """Look for what is named, before torch or a simulator is loaded.
-
-    Raises:
-        VlaEvalError: there is no such task, policy, dataset or interpreter.
-    """
+    """Look for what is named, before torch or a simulator is loaded."""
     from vla_eval.data.info_file import require_folder
     from vla_eval.policies.recipe import load_policy_recipe
     from vla_eval.tasks.catalog import task_spec

@@ -38,11 +38,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 
 def run(args: argparse.Namespace) -> int:
-    """Print the comparison.
-
-    Raises:
-        VlaEvalError: a RUN is not a run folder, or there is nothing to compare.
-    """
+    """Print the comparison."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.results.sweep import compare_runs
     from vla_eval.results.sweep_format import render_sweep, sweep_table

@@ -101,11 +101,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Do the action; what it reads is looked for first, before torch is loaded.
-
-    Raises:
-        VlaEvalError: an unknown task, no such folder, or what the action raises.
-    """
+    """Do the action; what it reads is looked for first, before torch is loaded."""
     from vla_eval.data.info_file import require_folder
     from vla_eval.tasks.catalog import task_spec
 

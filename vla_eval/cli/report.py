@@ -69,11 +69,7 @@ class _ColumnNames:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Read the runs, and print their table or write their page.
-
-    Raises:
-        VlaEvalError: a RUN is not a run folder, holds nothing yet, or has no such baseline.
-    """
+    """Read the runs, and print their table or write their page."""
     # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.probe.report_text import probe_texts
     from vla_eval.storage.run_folder import read_run

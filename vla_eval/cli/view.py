@@ -41,11 +41,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 
 def run(args: argparse.Namespace) -> int:
-    """Find the rerun files and open them.
-
-    Raises:
-        VlaEvalError: RUN is neither run folder nor dataset, holds no such episode, or there is no screen.
-    """
+    """Find the rerun files and open them."""
     # Here and not above: `mikasa-vla --help` need not wait for them.
     from vla_eval.viz.picking import MOST_OPENED
     from vla_eval.workers.children import bound_command
@@ -69,11 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _viewer() -> str:
-    """Return the viewer's program, which `python -m rerun` starts: a child of it would outlive us.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-    """
+    """Return the viewer's program, which `python -m rerun` starts: a child of it would outlive us."""
     from importlib.util import find_spec
 
     from vla_eval.errors import MissingDependencyError

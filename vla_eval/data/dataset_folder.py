@@ -23,11 +23,7 @@ DEEPEST = 3  # folders below the named one in which datasets are looked for, for
 
 
 def check_complete(root: Path) -> Facts:
-    """Return what a dataset is, after comparing all of its files with their digests.
-
-    Raises:
-        DatasetError: it is not finished, or files are missing or not what they were.
-    """
+    """Return what a dataset is, after comparing all of its files with their digests."""
     check_folder(root)
     _check_files(root, facts := require_finished(root))
     return facts

@@ -51,20 +51,12 @@ IMAGE_BEGINNINGS = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"II*\0", b"MM\0*")  
 def frames_for_lerobot(
     files: Sequence[TableFile], features: Features, episodes: Sequence[int] | None = None
 ) -> Dataset:
-    """Return the rows of frames, of all episodes or of these, as lerobot's `load_nested_dataset` does.
-
-    Raises:
-        DatasetError: a table has other columns or types than `features`, those of `meta/info.json`.
-    """
+    """Return the rows of frames, of all episodes or of these, as lerobot's `load_nested_dataset` does."""
     return _as_dataset(pa.concat_tables([_frames(file, features, episodes) for file in files]), features)
 
 
 def read_episodes(root: Path) -> Dataset:
-    """Return one row per episode, as lerobot's `load_episodes` does.
-
-    Raises:
-        DatasetError: see `read_table`; or the episodes are not numbered from 0 on and one after the other.
-    """
+    """Return one row per episode, as lerobot's `load_episodes` does."""
     tables = []
     for path in table_paths(root, EPISODE_TABLES):
         table = read_table(path, lambda name: not name.startswith(STATISTICS))
@@ -82,9 +74,6 @@ def read_tasks(root: Path) -> pd.DataFrame:
     """Return the sentences in the order of `task_index`, by which lerobot looks them up.
 
     lerobot's `load_tasks` keeps the order of the file.
-
-    Raises:
-        DatasetError: see `read_table`; or the sentences are not numbered 0, 1, 2 …
     """
     path = root / TASKS_FILE
     table = read_table(path)
@@ -102,11 +91,7 @@ def read_tasks(root: Path) -> pd.DataFrame:
 
 
 def read_statistics(root: Path) -> dict[str, dict[str, NDArray[np.generic]]] | None:
-    """Return field -> name -> numbers, as lerobot's `load_stats` does; None if there is no such file.
-
-    Raises:
-        DatasetError: the file holds something else.
-    """
+    """Return field -> name -> numbers, as lerobot's `load_stats` does; None if there is no such file."""
     path = root / STATS_FILE
     if not path.exists():
         return None

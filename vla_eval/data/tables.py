@@ -47,10 +47,6 @@ def read_table(
 
     The file is of a folder that `check_folder` has seen; it may have images as lerobot embeds them
     `with_images`.
-
-    Raises:
-        DatasetError: it is damaged, does not fit into memory, or has a column of anything but numbers, text
-            and lists of them.
     """
     try:
         with pq.ParquetFile(str(path.absolute())) as file:
@@ -88,11 +84,7 @@ def read_columns(root: Path) -> Columns:
 
 
 def columns_of(files: Sequence[TableFile]) -> Columns:
-    """Return the numbers and sentences of frames, without images and annotations.
-
-    Raises:
-        DatasetError: a table lacks a column that the first one has, or a row has no value.
-    """
+    """Return the numbers and sentences of frames, without images and annotations."""
     names = [
         column.name
         for column in files[0].table.schema

@@ -14,11 +14,7 @@ NEAR_M = 0.01  # what is nearer to the camera, or behind it, is not seen
 
 
 def boxes_of_cue(env: MemoryTableEnv, row: int, cameras: tuple[str, ...]) -> CueBoxes:
-    """Return the boxes that hold the cue of one parallel environment, in the images of these cameras.
-
-    Raises:
-        TaskArgumentError: the task has no cue phase.
-    """
+    """Return the boxes that hold the cue of one parallel environment, in the images of these cameras."""
     places, size = env.cue_places_m(row), env.cue_size_m()
     found = {}
     for name in cameras:

@@ -133,11 +133,7 @@ class OfficialEnv:
 
 
 def official_class(row: TaskSpec) -> Any:
-    """Return the official class of a task.
-
-    Raises:
-        MissingDependencyError: the package is not installed.
-    """
+    """Return the official class of a task."""
     part = "vla" if row.suite == "mikasa_vla_90" else "rl"
     try:
         importlib.import_module(f"{PACKAGE}.{part}.memory_envs")
@@ -174,11 +170,7 @@ def _build(cls: Any, settings: EnvSettings) -> Any:
 
 
 def _wording(row: TaskSpec, info: Any) -> dict[str, str]:
-    """Return the angle of a Rotate task, which the official sentence of each episode states.
-
-    Raises:
-        SpecMismatchError: the environment's sentence is another one.
-    """
+    """Return the angle of a Rotate task, which the official sentence of each episode states."""
     if row.instruction is None or "{angle_deg}" not in row.instruction:
         return {}
     before, after = row.instruction.split("{angle_deg}")

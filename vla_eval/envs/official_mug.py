@@ -44,10 +44,6 @@ def provide_mug(mug: object, *, task: str) -> str:
     Args:
         mug: `ycb` or `stand_in`.
         task: for messages.
-
-    Raises:
-        TaskArgumentError: another value.
-        MissingDependencyError: the YCB asset is not installed.
     """
     if mug not in (YCB, STAND_IN):
         raise TaskArgumentError(f"{task}: mug={mug!r}: expected '{YCB}' or '{STAND_IN}'.")

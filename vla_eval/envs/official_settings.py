@@ -9,12 +9,7 @@ ARGUMENTS = ("horizon_steps", "mug")
 
 
 def check_official(settings: EnvSettings, row: TaskSpec) -> None:
-    """Refuse settings that the official environments do not have.
-
-    Raises:
-        UnknownNameError: there is no such argument.
-        TaskArgumentError: a setting is impossible.
-    """
+    """Refuse settings that the official environments do not have."""
     check_names("argument", settings.kwargs, ARGUMENTS, where=row.id)
     asked = {
         "sim_backend=gpu": settings.sim_backend == "gpu",

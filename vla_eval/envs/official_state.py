@@ -61,9 +61,6 @@ def read_candidates(row: TaskSpec, env: Any, *, revealed: bool) -> Candidates | 
         row: the task.
         env: its official environment, evaluated at this step.
         revealed: whether the choice has begun.
-
-    Raises:
-        SpecMismatchError: the environment has not the attributes of version 1.0.0.
     """
     if row.true_state == "items":
         names = _ITEMS[_family(row)]

@@ -92,12 +92,7 @@ def _render_device_name() -> str:
 
 
 def take_images(env: Any, cameras: tuple[str, ...]) -> dict[str, ImageArray]:
-    """Return camera name -> (B, H, W, 3) uint8.
-
-    Raises:
-        RenderingError: no camera was declared when the environment was made, or the scene has an environment
-            map.
-    """
+    """Return camera name -> (B, H, W, 3) uint8."""
     if not cameras:
         raise RenderingError(
             "Images were requested, but this environment was made without cameras and has no renderer. "

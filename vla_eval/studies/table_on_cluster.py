@@ -32,9 +32,6 @@ def finetune_on(
     """Run the fine-tunings; a GPU each, where there are GPUs. Return False if asked to stop.
 
     `logs` is a folder on storage that all machines share. `is_tiny` builds lerobot's π0 in its tiny form.
-
-    Raises:
-        TrainingError: one of them failed, after the others were finished; the message names all.
     """
     logs.mkdir(parents=True, exist_ok=True)
     jobs = [FinetuneJob(config=one.config, command=command, name=one.name) for one in todo]

@@ -21,11 +21,7 @@ from vla_eval.models.episodes.samples import decisions
 
 
 def training_dataset(root: Path, *, allow_unreplayed: bool) -> OpenDataset:
-    """Return a folder's dataset if it is complete and was replayed without a mismatch, unless that is waived.
-
-    Raises:
-        DatasetError: it is not, or the folder holds several.
-    """
+    """Return a folder's dataset if it is complete and replayed without a mismatch, unless that is waived."""
     dataset = open_dataset(one_dataset(root))
     root, control_mode = dataset.root, dataset.facts.control_mode
     if not dataset.was_replayed and not allow_unreplayed:
@@ -60,9 +56,6 @@ def chosen_episodes(dataset: OpenDataset, recipe: FinetuneRecipe, policy: Any) -
 
     Unless the recipe says otherwise, failed episodes are left out, except for a policy that is trained on
     rewards, which distinguish them.
-
-    Raises:
-        DatasetError: no episode would be left.
     """
     reads_rewards = getattr(policy, "reward", None) is not None
     keeps = recipe.failed_episodes == "keep" or (recipe.failed_episodes is None and reads_rewards)

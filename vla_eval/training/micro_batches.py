@@ -32,9 +32,6 @@ def add_gradient(
     samples that count alike (ACT's is one over actions that are not padding, so not quite), except for noise
     that the policy draws: it is drawn part by part. `autocast` is the precision of the forward pass, None:
     the weights'; `scale` is applied to the loss before the backward pass.
-
-    Raises:
-        TrainingError: a field of the batch cannot be divided.
     """
     whole, reported = torch.zeros(()), dict[str, Any]()
     parts = [(1.0, batch)] if size is None else list(_parts(batch, size))

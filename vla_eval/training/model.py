@@ -44,9 +44,6 @@ def make_model(job: TrainingJob, meta: Any) -> Any:
     """Return the policy with its weights on its device, wrapped by peft where LoRA is trained.
 
     The job's policy notes where its weights came from.
-
-    Raises:
-        VlaEvalError: the base does not fit, or something would have to be downloaded.
     """
     config = job.policy
     with _plain_errors(job, "cannot be built"):

@@ -36,9 +36,6 @@ def write_video(
     `thumbnail` is a JPEG of the cue and next to it the choice, `stills` a small one of cue, reveal and touch,
     for `report --filmstrip`. `frame_rate_hz` are captured steps per second of the episode, so that the video
     is as fast as the episode, but for the cue.
-
-    Raises:
-        ViewingError: no step has images, or the file cannot be written.
     """
     captured = tape.captured()
     if not captured:

@@ -58,11 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _look_for(args: argparse.Namespace) -> None:
-    """Look for what is named, before torch is loaded.
-
-    Raises:
-        VlaEvalError: there is no such checkpoint, folder or recipe with something to train.
-    """
+    """Look for what is named, before torch is loaded."""
     from vla_eval.checkpoints.files import find_checkpoint
     from vla_eval.config.finetuning import FinetuneConfig
     from vla_eval.training.request import load_finetune_recipe

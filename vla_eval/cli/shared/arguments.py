@@ -211,9 +211,6 @@ def read_config[T](
         asks: what to name where neither a file nor enough flags are given.
         needed: field -> flag that must be there without a file.
         example: a command.
-
-    Raises:
-        VlaEvalError: see `load_recipe`; or a needed flag is missing.
     """
     from vla_eval.tasks.catalog import with_version
 

@@ -23,10 +23,6 @@ def backend_of(
         args: of the command line.
         needs: returns the files that each machine of a cluster must have; called if there is a cluster.
         notes_kinds: whether results say what kind of machine they are from; else there must be one kind.
-
-    Raises:
-        RecipeError: the flag's value is not a cluster.
-        MissingDependencyError, ClusterError: see `cluster`.
     """
     if args.cluster is None:
         yield LOCAL

@@ -26,11 +26,7 @@ class Evaluations(NamedTuple):
 def evaluate_one(
     resolved: ResolvedEvaluation, args: argparse.Namespace, *, stop: progress.StopRequest
 ) -> EvaluationSummary:
-    """Run or resume an evaluation as the command line asks, with progress; `args` as for `evaluate_each`.
-
-    Raises:
-        VlaEvalError: see `evaluate`.
-    """
+    """Run or resume an evaluation as the command line asks, with progress; `args` as for `evaluate_each`."""
     return progress.evaluate_with_progress(
         resolved,
         command=typed_command(),
@@ -51,10 +47,6 @@ def evaluate_each(
         runs: run folder and configuration of each.
         args: of the command line: `--shard`, `--allow-environment-change` and `--json-progress`.
         backend: where the workers run.
-
-    Raises:
-        FolderInUseError: another process is still writing when all others are finished.
-        VlaEvalError: see `evaluate`.
     """
     n_errors = 0
     put_off: list[tuple[Path, EvalConfig]] = []

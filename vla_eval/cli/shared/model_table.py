@@ -41,11 +41,7 @@ EVAL_FLAGS = (
 
 
 def finetune_table(args: argparse.Namespace) -> int:
-    """Fine-tune what is not finished; the folders of the checkpoints go to standard output.
-
-    Raises:
-        VlaEvalError: a flag that a table does not take, a missing dataset, a mistake in a recipe.
-    """
+    """Fine-tune what is not finished; the folders of the checkpoints go to standard output."""
     _refuse(args, FINETUNE_FLAGS)
     study = _study(args, rows=args.policy)
     with backend_of(args, needs=lambda: needed_files(study)) as backend:
@@ -78,11 +74,7 @@ def describe_table(args: argparse.Namespace) -> list[str]:
 
 
 def evaluate_table(args: argparse.Namespace) -> int:
-    """Evaluate every checkpoint and the controls, then print one table.
-
-    Raises:
-        VlaEvalError: a flag that a table does not take; a row that has not been fine-tuned.
-    """
+    """Evaluate every checkpoint and the controls, then print one table."""
     from vla_eval.cli.shared.output import check_baseline, check_table_arguments
 
     _refuse(args, EVAL_FLAGS)

@@ -77,12 +77,7 @@ def print_in(fmt: str, text: str) -> None:
 
 
 def check_table_arguments(args: argparse.Namespace) -> None:
-    """Refuse a combination that no table has, before the run and not after it.
-
-    Raises:
-        ReportError: a preset or --wide in a format that does not take it.
-        UnknownNameError: there is no such list of published results.
-    """
+    """Refuse a combination that no table has, before the run and not after it."""
     from vla_eval.results.published.literature import load_published
     from vla_eval.results.table_formats import check_format
 
@@ -117,10 +112,6 @@ def hint_merge(whole: Path, shard: Shard) -> None:
 
 
 def check_baseline(baseline: str | None, policies: Sequence[str]) -> None:
-    """Refuse a baseline that is not evaluated, before the run and not after it.
-
-    Raises:
-        UnknownNameError: it is none of the policies.
-    """
+    """Refuse a baseline that is not evaluated, before the run and not after it."""
     if baseline is not None and baseline not in policies:
         raise unknown_name("policy", baseline, policies, where="--baseline")

@@ -26,11 +26,7 @@ def replay_each(
     workers: int | Literal["auto"] = "auto",
     backend: Backend = LOCAL,
 ) -> int:
-    """Replay datasets and print a line for each; return the exit code.
-
-    Raises:
-        VlaEvalError: see `vla_eval.data.replaying.replay.replay`.
-    """
+    """Replay datasets and print a line for each; return the exit code."""
     from vla_eval.data.replaying.replay import replay
 
     code = 0

@@ -89,9 +89,6 @@ def evaluate_with_progress(
     """Run an evaluation with progress on standard error, and end early if asked to stop.
 
     `json_progress` is the file descriptor of lines for other programs.
-
-    Raises:
-        VlaEvalError: see `evaluate`.
     """
     capture = resolved.config.capture
     progress = Progress(stop, out=resolved.out, capture=capture, json_progress=json_progress)

@@ -42,9 +42,6 @@ def copy_with_actions(
     """Write a dataset with the images and states of another one; it appears whole. Return what it is.
 
     `episodes` are those of the source with other actions; the recipe says which of these are stored.
-
-    Raises:
-        DatasetError: the folder is there already, or the source is damaged.
     """
     if path.exists():
         raise DatasetError(f"{path}: is there already. Name another --out.")

@@ -44,11 +44,7 @@ OF_JOINTS = re.compile(r"joint|motor|\.pos$|shoulder|elbow|wrist_(flex|roll)", r
 
 
 def lerobot_source(opened: LocalDataset) -> Source:
-    """Read a dataset without its images.
-
-    Raises:
-        DatasetError: it is damaged, or its fields are not those of a layout that can be read.
-    """
+    """Read a dataset without its images."""
     root, dataset, columns = opened.root, opened.whole, opened.columns
     features = dataset.meta.features
     layout = lerobot_layout(features, where=root)

@@ -69,9 +69,6 @@ def episode_rows(dataset: Any, columns: Mapping[str, Any]) -> list[EpisodeRows]:
     """Return where the episodes of a loaded `LeRobotDataset` are.
 
     `columns` has `index`, `episode_index` and `timestamp`, as arrays or tensors of the loaded rows.
-
-    Raises:
-        DatasetError: the frames of an episode do not follow each other.
     """
     indices, numbers, times_s = (columns[key].tolist() for key in ("index", "episode_index", "timestamp"))
     episodes = []
@@ -175,10 +172,6 @@ def frames_on_disk(source: FrameSource, cache: Path | None) -> dict[str, Path]:
 
     The folder, in `cache` or by default the user's, appears by a rename, so half a cache is never seen; of
     several processes that ask at once one decodes and the others wait.
-
-    Raises:
-        DatasetError: there is not enough room, or a video cannot be read.
-        StorageFullError: the disk became full on the way.
     """
     name = f"{FRAMES_FOLDER}/{dataset_digest(source)}"
     final = cached(name) if cache is None else cache / name

@@ -28,9 +28,6 @@ def connect_client(urls: Sequence[str], settings: RemoteSettings, *, connect_sec
 
     A worker of a cluster takes one of its own machine, if there is one. All servers are of the same policy,
     so that no result depends on the choice.
-
-    Raises:
-        RemotePolicyError: one of them is not a policy server, or is not there after `connect_seconds`.
     """
     near = [url for url in urls if urlsplit(url).hostname == os.environ.get(NEAR_VARIABLE)]
     connected = connect_all(near or urls, settings, connect_seconds=connect_seconds)

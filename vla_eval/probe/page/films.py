@@ -23,11 +23,7 @@ JPEG_QUALITY = 75
 
 
 def film_pairs(worlds: Sequence[Found[World]], pairs: Sequence[ChoicePairs]) -> tuple[FilmPair, ...]:
-    """Return the first captured pair of each policy with a swapped cue, of `MOST_PAIRS` policies.
-
-    Raises:
-        ViewingError: a video cannot be read.
-    """
+    """Return the first captured pair of each policy with a swapped cue, of `MOST_PAIRS` policies."""
     runs = [one.run for one in worlds]
     films: dict[tuple[str, str, int], FilmPair] = {}
     for one in pairs:
