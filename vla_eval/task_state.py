@@ -18,38 +18,31 @@ PHASES: tuple[Phase, ...] = get_args(Phase)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskStatus:
-    """What the task says of the episode so far; reading it changes nothing.
+    """What the task says of the episode so far; reading it changes nothing."""
 
-    Attributes:
-        phase: the phase at this step; None where the environment does not show it.
-        success: the success rule holds at this very step.
-        fail: the episode is lost for good (`strict_choice`, first wrong candidate).
-        target: index of the right candidate; None for a task without candidates or with several right ones.
-        right_first_choices: the candidates that it is right to touch first; empty without candidates.
-        n_candidates: how many candidates there are; 0 for a task without candidates.
-        first_choice: index of the candidate that was touched first in the response phase, if any.
-        n_wrong_choices: how many different wrong candidates have been touched in the response phase.
-        chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
-            environment; None where it has to be measured.
-        candidate_places: the place at which each candidate lies when the response phase begins, in candidate
-            order: 0 is the rightmost as the robot sees it (-y). Empty where places are not known.
-        right_candidates: the right candidates, in the order shown; None where it is not said.
-        touched_candidates: those touched so far, in the order of first touch; None where it is not said.
-        turned_rad: how far the object of the task is turned from its first orientation; None without one.
-    """
-
-    phase: Phase | None
-    success: bool
-    fail: bool = False
+    phase: Phase | None  # the phase at this step; None where the environment does not show it
+    success: bool  # the success rule holds at this very step
+    fail: bool = False  # the episode is lost for good (`strict_choice`, first wrong candidate)
+    # index of the right candidate; None for a task without candidates or with several right ones
     target: int | None = None
-    n_candidates: int = 0
+    n_candidates: int = 0  # how many candidates there are; 0 for a task without candidates
+    # index of the candidate that was touched first in the response phase, if any
     first_choice: int | None = None
+    # how many different wrong candidates have been touched in the response phase
     n_wrong_choices: int = 0
+    # the candidates that it is right to touch first; empty without candidates
     right_first_choices: tuple[int, ...] = ()
+    # success rate of a perfect arm that ignores the cue, with the arguments of this environment; None
+    # where it has to be measured
     chance_success: float | None = None
+    # the place at which each candidate lies when the response phase begins, in candidate order: 0 is the
+    # rightmost as the robot sees it (-y). Empty where places are not known.
     candidate_places: tuple[int, ...] = ()
+    # the right candidates, in the order shown; None where it is not said
     right_candidates: tuple[int, ...] | None = None
+    # those touched so far, in the order of first touch; None where it is not said
     touched_candidates: tuple[int, ...] | None = None
+    # how far the object of the task is turned from its first orientation; None without one
     turned_rad: float | None = None
 
 

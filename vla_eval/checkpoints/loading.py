@@ -57,18 +57,14 @@ NO_DOWNLOADS: dict[str, object] = {"pretrained_backbone_weights": None, "load_vl
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoadOptions:
-    """How to load.
+    """How to load."""
 
-    Attributes:
-        device: `cpu`, `cuda`, `cuda:1` …
-        dtype: `float32` or `bfloat16`, for policies that have such a setting; None: as saved.
-        tokenizer: folder of the tokenizer; None: the one in the checkpoint, else the one it names.
-        base_checkpoint: where the base of a LoRA adapter lies; None: where it was in training.
-    """
-
-    device: str
+    device: str  # `cpu`, `cuda`, `cuda:1` …
+    # `float32` or `bfloat16`, for policies that have such a setting; None: as saved
     dtype: str | None = None
+    # folder of the tokenizer; None: the one in the checkpoint, else the one it names
     tokenizer: str | None = None
+    # where the base of a LoRA adapter lies; None: where it was in training
     base_checkpoint: str | None = None
 
 

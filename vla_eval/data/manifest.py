@@ -54,17 +54,7 @@ FETCH_AGAIN = "The file was changed by another program; fetch or record the data
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedEpisode:
-    """One demonstration: an episode is a function of (task, arguments, seed, actions).
-
-    Attributes:
-        cue_steps, delay_steps: lengths of the first two phases, in control steps.
-        n_steps: number of frames, one per control step.
-        success_step: control steps executed when the success rule first held; None if it never did.
-        actions: the executed actions, (n_steps, A) float32, as `encode_actions` writes them.
-        intended_actions: what the expert asked for before noise was added; None without noise.
-        states_sha256: digest of all states from reset to the end, see `states_digest` in `demonstrations`.
-        images_sha256: camera -> digest of its raw frames, (n_steps, H, W, 3) uint8, before encoding.
-    """
+    """One demonstration: an episode is a function of (task, arguments, seed, actions)."""
 
     episode_index: Count
     task: str
@@ -74,13 +64,17 @@ class RecordedEpisode:
     instruction: str
     expert: str
     expert_version: Positive
+    # `cue_steps`, `delay_steps`: lengths of the first two phases, in control steps
     cue_steps: Count
     delay_steps: Count
-    n_steps: Positive
+    n_steps: Positive  # number of frames, one per control step
+    # control steps executed when the success rule first held; None if it never did
     success_step: Positive | None
-    actions: str
-    intended_actions: str | None
+    actions: str  # the executed actions, (n_steps, A) float32, as `encode_actions` writes them
+    intended_actions: str | None  # what the expert asked for before noise was added; None without noise
+    # digest of all states from reset to the end, see `states_digest` in `demonstrations`
     states_sha256: str
+    # camera -> digest of its raw frames, (n_steps, H, W, 3) uint8, before encoding
     images_sha256: dict[str, str]
 
     def action_rows(self) -> FloatArray:

@@ -22,26 +22,19 @@ class Source:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Base:
-    """A published checkpoint.
+    """A published checkpoint."""
 
-    Attributes:
-        name: of its folder in `checkpoints/`, as recipes name it.
-        title: for people.
-        terms: the licence, as its authors state it; the Hub's own statement is shown, too.
-        parts: what is fetched, small parts first: one that is refused is then known before the large ones.
-        options: of its family's converter, which makes a LeRobot checkpoint of the files; `{source}` is
-            their folder. None: they are one.
-        fields: of its configuration, where they are not the defaults of its type.
-        is_backbone: the files are not a checkpoint, but weights of a part of a policy; the name is
-            torchvision's.
-    """
-
-    name: str
-    title: str
-    terms: str
+    name: str  # of its folder in `checkpoints/`, as recipes name it
+    title: str  # for people
+    terms: str  # the licence, as its authors state it; the Hub's own statement is shown, too
+    # what is fetched, small parts first: one that is refused is then known before the large ones
     parts: tuple[Source, ...]
+    # of its family's converter, which makes a LeRobot checkpoint of the files; `{source}` is their
+    # folder. None: they are one.
     options: Mapping[str, Any] | None = None
+    # of its configuration, where they are not the defaults of its type
     fields: Mapping[str, Any] = field(default_factory=dict)
+    # the files are not a checkpoint, but weights of a part of a policy; the name is torchvision's
     is_backbone: bool = False
 
     @property
@@ -52,16 +45,13 @@ class Base:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tiny:
-    """The form of a family in a table of tiny models.
+    """The form of a family in a table of tiny models."""
 
-    Attributes:
-        recipe: in `policies/`; empty: the row's own recipe, or, of a family with `built_tiny`, none.
-        fields: of the configuration that differ from the recipe's.
-        sets_chunk: the chunk is as long as the row executes; False: it follows from other fields.
-    """
-
+    # in `policies/`; empty: the row's own recipe, or, of a family with `built_tiny`, none
     recipe: str = ""
+    # of the configuration that differ from the recipe's
     fields: Mapping[str, Any] = field(default_factory=dict)
+    # the chunk is as long as the row executes; False: it follows from other fields
     sets_chunk: bool = True
 
 

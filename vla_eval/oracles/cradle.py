@@ -36,23 +36,19 @@ IMAGINED_VELOCITY_X_M_S = (0.0, 0.05)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CradleTactics:
-    """Parameters that depend on the ball's speed; a call returns the expert of an episode.
+    """Parameters that depend on the ball's speed; a call returns the expert of an episode."""
 
-    Attributes:
-        imagined_velocity_y_m_s: range of the initial speed along y, from which the blind arm draws its ball.
-        nominal_velocity_m_s: the rolling ball's (x, y) velocity that is assumed while it is out of view.
-        push_speed_m_s: speed along x at which the gap is closed, and from which the meeting point follows.
-        meet_y_min_m: the arm does not wait farther back than this.
-        min_reach_m: nor closer to the base than this, where the inverse kinematics finds few low poses.
-        aligned_m: the gap is closed once ball and cradle are this close along y. An arm that is hardly
-            faster approaches so slowly that both would have passed the goal by then.
-    """
-
+    # range of the initial speed along y, from which the blind arm draws its ball
     imagined_velocity_y_m_s: tuple[float, float]
+    # the rolling ball's (x, y) velocity that is assumed while it is out of view
     nominal_velocity_m_s: tuple[float, float]
+    # speed along x at which the gap is closed, and from which the meeting point follows
     push_speed_m_s: float = 0.47
-    meet_y_min_m: float = -0.5
+    meet_y_min_m: float = -0.5  # the arm does not wait farther back than this
+    # nor closer to the base than this, where the inverse kinematics finds few low poses
     min_reach_m: float = 0.30
+    # the gap is closed once ball and cradle are this close along y. An arm that is hardly faster
+    # approaches so slowly that both would have passed the goal by then.
     aligned_m: float = 0.006
 
     def __call__(self, *, rng: np.random.Generator, imagined: bool) -> "CradleExpert":

@@ -161,12 +161,9 @@ def _advance(play: _Play, translation: model.Vector, turn: float, gripper: float
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PegTurns:
-    """Makes the expert of an episode.
+    """Makes the expert of an episode."""
 
-    Attributes:
-        angle_range_rad: range from which the blind arm's angle is drawn; `signed`: whether it has a sign.
-    """
-
+    # range from which the blind arm's angle is drawn; `signed`: whether it has a sign
     angle_range_rad: tuple[float, float]
     signed: bool
 

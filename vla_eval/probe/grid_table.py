@@ -17,18 +17,15 @@ _Run = tuple[GridWorld, Records]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridPart:
-    """The episodes of a cell with one first inference.
-
-    Attributes:
-        inferences: which inferences fall into the cue, and how many steps of the response are executed
-            before the first inference of the response.
-        n_seen: frames of the cue that the policy is given; None while no record says what it reads.
-        success, followed: episodes that succeed, and that follow the cue; None without a result.
-    """
+    """The episodes of a cell with one first inference."""
 
     first_inference_step: int
+    # which inferences fall into the cue, and how many steps of the response are executed before the
+    # first inference of the response
     inferences: Inferences
+    # frames of the cue that the policy is given; None while no record says what it reads
     n_seen: int | None
+    # `success`, `followed`: episodes that succeed, and that follow the cue; None without a result
     success: Share | None
     followed: Share | None
     n_errors: int

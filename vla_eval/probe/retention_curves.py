@@ -25,19 +25,15 @@ class RetentionPoint(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Retention:
-    """How the delay affects one policy on one task.
-
-    Attributes:
-        of: of the episodes, those that follow the cue; or of the pairs, those that follow it in both worlds.
-        points: by growing delay, of all episodes or pairs with a result.
-        half_life: of the episodes or pairs that have a result at each delay; None where it is undefined.
-    """
+    """How the delay affects one policy on one task."""
 
     task: str
     policy: str
     n_action_steps: int
+    # of the episodes, those that follow the cue; or of the pairs, those that follow it in both worlds
     of: RetentionOf
-    points: tuple[RetentionPoint, ...]
+    points: tuple[RetentionPoint, ...]  # by growing delay, of all episodes or pairs with a result
+    # of the episodes or pairs that have a result at each delay; None where it is undefined
     half_life: HalfLife | None
 
 

@@ -30,39 +30,31 @@ from vla_eval.tasks.catalog import task_spec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeRow:
-    """One policy in one world, compared with the world as it is drawn, or with another one of its delay.
-
-    Attributes:
-        delay_steps: its delay; None for a task without one.
-        inferences: which inferences fall into the cue; None without phases, or if their lengths are drawn.
-        n_pairs: episodes with a result in this world and in the one that it is compared with.
-        n_without_choice: episodes of this world in which no candidate was touched; None without candidates.
-        success: episodes of this world that succeed; None without a result.
-        chance: rate of following the cue without memory; None where it is not known.
-        mistakes: the first mistakes of its episodes; None where touches are not known.
-        kept: how many items are kept; None where touches are not known, or one item is right.
-        over_delay: of another appearance: by how much more is followed than after the longest delay.
-        left: share of following that this world leaves, and its interval; None for swaps and `none`.
-        p_value: exact paired test against that world; corrected_p: after Holm, over the table.
-    """
+    """One policy in one world, compared with the world as it is drawn, or with another one of its delay."""
 
     task: str
     policy: str
     n_action_steps: int
     intervention: Intervention
     level: Level
-    delay_steps: int | None
+    delay_steps: int | None  # its delay; None for a task without one
+    # which inferences fall into the cue; None without phases, or if their lengths are drawn
     inferences: Inferences | None
-    n_pairs: int
+    n_pairs: int  # episodes with a result in this world and in the one that it is compared with
     swap: SwapQuantities | None
     followed: Share | None
+    # episodes of this world in which no candidate was touched; None without candidates
     n_without_choice: int | None
-    success: Share | None
-    chance: float | None
-    mistakes: Mistakes | None
+    success: Share | None  # episodes of this world that succeed; None without a result
+    chance: float | None  # rate of following the cue without memory; None where it is not known
+    mistakes: Mistakes | None  # the first mistakes of its episodes; None where touches are not known
+    # how many items are kept; None where touches are not known, or one item is right
     kept: Capacity | None
+    # of another appearance: by how much more is followed than after the longest delay
     over_delay: Contrast | None
+    # share of following that this world leaves, and its interval; None for swaps and `none`
     left: tuple[float, Range] | None
+    # exact paired test against that world; corrected_p: after Holm, over the table
     p_value: float | None
     corrected_p: float | None
     n_errors: int

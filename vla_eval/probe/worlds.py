@@ -44,43 +44,35 @@ APPEARANCES: Mapping[str, AppearanceSettings] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeSettings:
-    """What a probe changes; see `interventions.INTERVENTIONS`, of which `probes` are keys.
-
-    Attributes:
-        swaps: values of `env.swap_cue`, and of `env.swap_order` for `order`.
-        delays, cues, lates, distractors: values of `env.delay_steps`, `env.cue_steps`, `env.cue_after_steps`
-            and `env.distract_steps`.
-        masks, appearances: keys of `MASKS` and `APPEARANCES`.
-        instructions: prompt sets.
-        reset_steps: control steps at which the policy is reset; none: the end of the cue, and the beginning
-            of the response if that is later.
-    """
+    """What a probe changes; see `interventions.INTERVENTIONS`, of which `probes` are keys."""
 
     probes: tuple[Intervention, ...] = ("swap", "blank", "delay", "reset")
-    swaps: tuple[int, ...] = (1,)
+    swaps: tuple[int, ...] = (1,)  # values of `env.swap_cue`, and of `env.swap_order` for `order`
+    # `delays`, `cues`, `lates`, `distractors`: values of `env.delay_steps`, `env.cue_steps`,
+    # `env.cue_after_steps` and `env.distract_steps`
     delays: tuple[int, ...] = (0, 5, 10, 20, 40, 80, 160, 320)
     cues: tuple[int, ...] = (1, 2, 3)
+    # `masks`, `appearances`: keys of `MASKS` and `APPEARANCES`
     masks: tuple[str, ...] = tuple(MASKS)
     lates: tuple[int, ...] = (5, 20)
     appearances: tuple[str, ...] = tuple(APPEARANCES)
     distractors: tuple[int, ...] = (3,)
-    instructions: tuple[str, ...] = ("paraphrased", "other_task", "no_content")
+    instructions: tuple[str, ...] = ("paraphrased", "other_task", "no_content")  # prompt sets
+    # control steps at which the policy is reset; none: the end of the cue, and the beginning of the
+    # response if that is later
     reset_steps: tuple[int, ...] = ()
     controls: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class World:
-    """One evaluation of a probe.
-
-    Attributes:
-        intervention: what is changed; `none` for the world that the others are compared with. `delay_swap`
-            is compared with the `delay` of the same level.
-        level: by how much: the swap's number, a number of steps, the step of a reset, or a prompt set.
-    """
+    """One evaluation of a probe."""
 
     task: str
+    # what is changed; `none` for the world that the others are compared with. `delay_swap` is compared
+    # with the `delay` of the same level.
     intervention: Intervention
+    # by how much: the swap's number, a number of steps, the step of a reset, or a prompt set
     level: Level
     config: EvalConfig
 

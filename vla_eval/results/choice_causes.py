@@ -35,22 +35,17 @@ class Habit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChoiceReport:
-    """The choices of a row's episodes with candidates.
-
-    Attributes:
-        causes: cause -> number of episodes; contains every cause.
-        confusion: by item and by place: (target, chosen or None) -> number of episodes. Empty if it was
-            not recorded, or if several candidates are right.
-        habits: by item and by place; None if there is nothing to test: fewer than three candidates, no
-            wrong choice, or nothing recorded.
-        reach_is_known: whether the records say how far the arm moved; otherwise no episode counts as
-            `could_not_move`.
-    """
+    """The choices of a row's episodes with candidates."""
 
     n_candidates: int
-    causes: Mapping[Cause, int]
+    causes: Mapping[Cause, int]  # cause -> number of episodes; contains every cause
+    # by item and by place: (target, chosen or None) -> number of episodes. Empty if it was not recorded,
+    # or if several candidates are right.
     confusion: Mapping[Kind, Mapping[tuple[int, int | None], int]]
+    # by item and by place; None if there is nothing to test: fewer than three candidates, no wrong
+    # choice, or nothing recorded
     habits: Mapping[Kind, Habit | None]
+    # whether the records say how far the arm moved; otherwise no episode counts as `could_not_move`
     reach_is_known: bool
 
 

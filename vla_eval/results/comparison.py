@@ -59,18 +59,14 @@ class Chance:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Evidence:
-    """What the statistics of one row are estimated from.
-
-    Attributes:
-        success: how often they succeed.
-        chance, ceiling: success without memory, and of the oracle, in the setting of the row.
-        comparisons: with each baseline of the table; None where there is no pair of episodes.
-    """
+    """What the statistics of one row are estimated from."""
 
     episodes: RowEpisodes
-    success: Success
+    success: Success  # how often they succeed
+    # `chance`, `ceiling`: success without memory, and of the oracle, in the setting of the row
     chance: Chance | None
     ceiling: float | None
+    # with each baseline of the table; None where there is no pair of episodes
     comparisons: tuple[Comparison | None, ...]
 
 

@@ -52,18 +52,13 @@ class RowKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """One independent run of a row.
-
-    Attributes:
-        copy: 0, or 1, 2 … if further run folders hold the same episodes with other trajectories or other
-            weights.
-        records: seed -> record.
-        weights: digests of the policy's weights; none for a policy without weights.
-    """
+    """One independent run of a row."""
 
     index: int
+    # 0, or 1, 2 … if further run folders hold the same episodes with other trajectories or other weights
     copy: int
-    records: Mapping[int, EpisodeRecord]
+    records: Mapping[int, EpisodeRecord]  # seed -> record
+    # digests of the policy's weights; none for a policy without weights
     weights: frozenset[str] = frozenset()
 
     @property
@@ -112,17 +107,14 @@ class RowEpisodes:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Grouping:
-    """All rows, in the order of the table.
-
-    Attributes:
-        n_doubles: run folder -> number of its episodes that an earlier folder already had.
-        further: run folders that hold the episodes of another folder with other trajectories or weights.
-        folders: by key: the run folders that hold episodes of the row.
-    """
+    """All rows, in the order of the table."""
 
     groups: Mapping[RowKey, RowEpisodes]
+    # run folder -> number of its episodes that an earlier folder already had
     n_doubles: Mapping[str, int]
+    # run folders that hold the episodes of another folder with other trajectories or weights
     further: tuple[str, ...]
+    # by key: the run folders that hold episodes of the row
     folders: Mapping[RowKey, tuple[StoredRun, ...]]
 
 

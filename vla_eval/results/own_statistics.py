@@ -21,16 +21,14 @@ class Episodes(NamedTuple):
 
 
 class Choices(NamedTuple):
-    """First choices; None without candidates.
+    """First choices; None without candidates."""
 
-    Attributes:
-        n_chose, n_chose_right: how many touched any candidate, and in how many of these the first was right.
-        right_if_chose: the share of the latter; right_if_chose_low, right_if_chose_high: its 95 % Wilson
-            interval, of one run.
-    """
-
+    # `n_chose`, `n_chose_right`: how many touched any candidate, and in how many of these the first was
+    # right
     n_chose: int | None
     n_chose_right: int | None
+    # the share of the latter; right_if_chose_low, right_if_chose_high: its 95 % Wilson interval, of one
+    # run
     right_if_chose: float | None
     right_if_chose_low: float | None
     right_if_chose_high: float | None

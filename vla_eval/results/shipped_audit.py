@@ -67,20 +67,16 @@ OFFICIAL_ARGUMENTS = {"mug"}  # that change nothing of what is audited
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
-    """The counts of one control on one task.
-
-    Attributes:
-        success_once, success_at_end: in how many of them the success rule held at any step, at the last; None
-            if episodes ended at their first success.
-        first_choice: in how many the first candidate touched was right; None without candidates.
-        chance: mean `chance_success` of the episodes; None if it has to be measured.
-    """
+    """The counts of one control on one task."""
 
     n_episodes: Count
+    # `success_once`, `success_at_end`: in how many of them the success rule held at any step, at the
+    # last; None if episodes ended at their first success
     success_once: Count
     success_at_end: Count | None
+    # in how many the first candidate touched was right; None without candidates
     first_choice: Count | None
-    chance: Rate | None
+    chance: Rate | None  # mean `chance_success` of the episodes; None if it has to be measured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

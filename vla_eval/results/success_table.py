@@ -14,20 +14,16 @@ SummaryInterval = Literal["wilson_over_tasks", "t_over_runs"]
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Statistic[V]:
-    """One statistic of a row: its estimate, and its columns and words in every format.
+    """One statistic of a row: its estimate, and its columns and words in every format."""
 
-    Attributes:
-        estimate: its value, from the evidence of a row; None where it is undefined.
-        cells: its columns in CSV and JSON, a public format: name -> value.
-        columns: its columns in tables for reading.
-        column_of: the column of a baseline, by its number from 0 and its name, where each has one.
-        notes: the footnotes on its values in all rows of a table.
-    """
-
+    # its value, from the evidence of a row; None where it is undefined
     estimate: Callable[[Evidence], V]
+    # its columns in CSV and JSON, a public format: name -> value
     cells: Callable[[V], Mapping[str, Cell]]
-    columns: tuple["Column[Row]", ...] = ()
+    columns: tuple["Column[Row]", ...] = ()  # its columns in tables for reading
+    # the column of a baseline, by its number from 0 and its name, where each has one
     column_of: "Callable[[int, str], Column[Row]] | None" = None
+    # the footnotes on its values in all rows of a table
     notes: "Callable[[Sequence[Row]], Iterable[str]]" = lambda _: ()
 
 
@@ -36,14 +32,12 @@ class Row:
     """One policy on one task, at one `n_action_steps` and one variant of the settings; or one run of it.
 
     `docs/statistics.md` says what each statistic means and how it is computed.
-
-    Attributes:
-        estimates: the value of each statistic, in the order of the columns of CSV and JSON.
-        run: which run, for one of several; it is compared with nothing, so that no test counts twice.
     """
 
     episodes: RowEpisodes
+    # the value of each statistic, in the order of the columns of CSV and JSON
     estimates: Mapping[Statistic[Any], Any]
+    # which run, for one of several; it is compared with nothing, so that no test counts twice
     run: Run | None = None
 
     def __getitem__[V](self, statistic: Statistic[V]) -> V:

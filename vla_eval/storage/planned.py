@@ -44,20 +44,15 @@ def named_checkpoints(policy: str) -> NamedCheckpoints | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedConfig:
-    """The part of a configuration that says which episodes there are; None is not known.
+    """The part of a configuration that says which episodes there are; None is not known."""
 
-    Attributes:
-        tasks: ids, maybe with their namespace; `task_versions`: id -> version of its rules.
-        policies: names, files, folders, `NAME=A,B,C` or `NAME:TASK=A,B,C`; `policy_names`: their names in
-            records.
-        n_action_steps: None also where each policy has its default.
-    """
-
+    # ids, maybe with their namespace; `task_versions`: id -> version of its rules
     tasks: tuple[str, ...] | None = None
     task_versions: dict[str, int] | None = None
+    # names, files, folders, `NAME=A,B,C` or `NAME:TASK=A,B,C`; `policy_names`: their names in records
     policies: tuple[str, ...] | None = None
     policy_names: tuple[str, ...] | None = None
-    n_action_steps: tuple[Positive, ...] | None = None
+    n_action_steps: tuple[Positive, ...] | None = None  # None also where each policy has its default
     episodes: Positive | None = None
     runs: Positive | None = None
     seed_start: Count | None = None

@@ -61,20 +61,16 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Session:
-    """One time that the run was started or continued.
+    """One time that the run was started or continued."""
 
-    Attributes:
-        started_at: ISO 8601, UTC.
-        environment_changes: how the environment differed from the one the run was started in.
-        plan_changes: by what the run grew: more episodes, runs, policies, tasks or n_action_steps.
-        sentences: lines on instructions that a policy's tokenizer cut, or took for that of another task.
-    """
-
-    started_at: str
+    started_at: str  # ISO 8601, UTC
     command: str
     options: Mapping[str, JsonValue]
+    # how the environment differed from the one the run was started in
     environment_changes: tuple[Change, ...] = ()
+    # by what the run grew: more episodes, runs, policies, tasks or n_action_steps
     plan_changes: tuple[Change, ...] = ()
+    # lines on instructions that a policy's tokenizer cut, or took for that of another task
     sentences: tuple[str, ...] = ()
 
 

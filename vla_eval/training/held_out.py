@@ -40,23 +40,18 @@ ID_DIGITS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldOut:
-    """The evaluations of one training.
-
-    Attributes:
-        out: run folder of the training.
-        last_step: its last step, whose checkpoint is evaluated in any case.
-        on_metrics: takes one line of metrics.
-        is_stopping: an evaluation ends early once it says yes, without a figure; `catch_up` resumes it.
-        said: warnings of earlier checkpoints' evaluations, without the checkpoint's name.
-    """
+    """The evaluations of one training."""
 
     settings: HeldOutConfig
     task: str
-    out: Path
-    last_step: int
+    out: Path  # run folder of the training
+    last_step: int  # its last step, whose checkpoint is evaluated in any case
+    # takes one line of metrics
     on_metrics: Callable[[Mapping[str, float | str]], None] = lambda _line: None
     say: Callable[[str], None] = lambda _line: None
+    # an evaluation ends early once it says yes, without a figure; `catch_up` resumes it
     is_stopping: Callable[[], bool] = lambda: False
+    # warnings of earlier checkpoints' evaluations, without the checkpoint's name
     said: set[str] = field(default_factory=set)
 
     @property

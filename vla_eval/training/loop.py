@@ -58,22 +58,17 @@ STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Listeners:
-    """Who gets the progress of a training.
+    """Who gets the progress of a training."""
 
-    Attributes:
-        on_model: called with the model before its optimizer is made.
-        on_sentence: called with what the policy has read of each sentence, after the first step that has it.
-        on_metrics: called with each line of metrics.
-        on_checkpoint: called with the folder of each checkpoint (`…/000100`) once it is there.
-        on_step: called with each step, counted from 1, and its seconds, loading included.
-        is_stopping: asked between steps; once it says yes, a checkpoint is written and training ends.
-    """
-
-    on_model: Callable[[Any], None]
+    on_model: Callable[[Any], None]  # called with the model before its optimizer is made
+    # called with what the policy has read of each sentence, after the first step that has it
     on_sentence: Callable[[SentenceReading], None]
-    on_metrics: Callable[[Mapping[str, float]], None]
+    on_metrics: Callable[[Mapping[str, float]], None]  # called with each line of metrics
+    # called with the folder of each checkpoint (`…/000100`) once it is there
     on_checkpoint: Callable[[Path], None]
+    # called with each step, counted from 1, and its seconds, loading included
     on_step: Callable[[int, float], None]
+    # asked between steps; once it says yes, a checkpoint is written and training ends
     is_stopping: Callable[[], bool]
 
 

@@ -113,13 +113,10 @@ class Runner(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunnerClass:
-    """The class of a runner, by its name: the parent need not import what only a worker needs.
+    """The class of a runner, by its name: the parent need not import what only a worker needs."""
 
-    Attributes:
-        target: `module:Class`, or a function that makes one; called with a heartbeat, a function that sends
-            the parent a `Notice`, and `options`.
-    """
-
+    # `module:Class`, or a function that makes one; called with a heartbeat, a function that sends the
+    # parent a `Notice`, and `options`
     target: str
     options: Mapping[str, Any] = field(default_factory=dict)  # Any: whatever it takes
 

@@ -20,14 +20,11 @@ MAX_KIND = 200  # characters of an exception's class
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failed:
-    """An episode, or one of a batch, could not be run.
-
-    Attributes:
-        refused: environment and policy cannot be made or do not fit, for a reason that this package
-            knows: it will be the same for every episode of the group.
-    """
+    """An episode, or one of a batch, could not be run."""
 
     error: EpisodeError
+    # environment and policy cannot be made or do not fit, for a reason that this package knows: it will
+    # be the same for every episode of the group
     refused: bool
 
 

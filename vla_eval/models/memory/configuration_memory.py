@@ -19,24 +19,14 @@ LEARNED_MODES = (EE_DELTA_POSE, EE_DELTA_POS, JOINT_POS)
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
 class MikasaMemoryConfig(EpisodeConfig):
-    """A small policy with a memory, or its twin without one.
+    """A small policy with a memory, or its twin without one."""
 
-    Attributes:
-        remembers: False for the twin, whose memory is reset at each step.
-        arm_cameras: the images whose camera is on the arm and moves with it.
-        free_translation: a part of the translation does not depend on where the demonstration ends, for
-            tasks that are more than a way to a place.
-        goal_of_one_motion: episodes in which the arm begins to move more than once do not teach the goal:
-            theirs is that of the last motion, and wrong until then. On ten tasks that kept the goal from
-            being learned at all.
-        joint_targets: actions are those of `pd_joint_pos`; `finetune` sets it by the dataset's control mode.
-        channels, patch_px, heads, key, memory, hidden, longest_span_steps: see `NetworkSizes`.
-        doubt_weight: of the loss that teaches the policy how large its error will be.
-    """
-
-    remembers: bool = True
+    remembers: bool = True  # False for the twin, whose memory is reset at each step
+    # the images whose camera is on the arm and moves with it
     arm_cameras: list[str] = field(default_factory=lambda: [CAMERA_KEYS["hand_camera"]])
 
+    # `channels`, `patch_px`, `heads`, `key`, `memory`, `hidden`, `longest_span_steps`: see
+    # `NetworkSizes`
     channels: int = 32
     patch_px: int = 4
     heads: int = 8
@@ -44,11 +34,16 @@ class MikasaMemoryConfig(EpisodeConfig):
     memory: int = 128
     hidden: int = 256
     longest_span_steps: float = 100.0
+    # a part of the translation does not depend on where the demonstration ends, for tasks that are more
+    # than a way to a place
     free_translation: bool = False
+    # episodes in which the arm begins to move more than once do not teach the goal: theirs is that of
+    # the last motion, and wrong until then. On ten tasks that kept the goal from being learned at all.
     goal_of_one_motion: bool = False
+    # actions are those of `pd_joint_pos`; `finetune` sets it by the dataset's control mode
     joint_targets: bool = False
 
-    doubt_weight: float = 0.1
+    doubt_weight: float = 0.1  # of the loss that teaches the policy how large its error will be
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -28,16 +28,12 @@ PATCH_PX = 16  # four convolutions of stride 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TransformerSizes:
-    """What the transformer is made of; the defaults are those of Octo-small.
+    """What the transformer is made of; the defaults are those of Octo-small."""
 
-    Attributes:
-        image_px: camera of the model -> edge of its square images, in the order of the tokens.
-        max_window: longest window that there are position embeddings for.
-        language_tokens, language_width: of the embedded instruction.
-    """
-
+    # camera of the model -> edge of its square images, in the order of the tokens
     image_px: Mapping[str, int]
-    max_window: int = 10
+    max_window: int = 10  # longest window that there are position embeddings for
+    # `language_tokens`, `language_width`: of the embedded instruction
     language_tokens: int = 16
     language_width: int = 768
     width: int = 384

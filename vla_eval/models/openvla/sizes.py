@@ -18,15 +18,10 @@ N_BINS = 256
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkSizes(VisionSizes):
-    """Sizes of all parts; the last block of SigLIP is never run either, like that of DINOv2.
+    """Sizes of all parts; the last block of SigLIP is never run either, like that of DINOv2."""
 
-    Attributes:
-        dino_width, dino_depth, dino_heads, dino_registers: DINOv2 as published. The last of `dino_depth`
-            blocks is never run: its output is not used, so the network does not have it.
-        vocabulary: rows of the embedding; `text_vocabulary`: those of the tokenizer. Action bins are the
-            last `N_BINS - 1` of the latter, counted from behind.
-    """
-
+    # `dino_width`, `dino_depth`, `dino_heads`, `dino_registers`: DINOv2 as published. The last of
+    # `dino_depth` blocks is never run: its output is not used, so the network does not have it.
     dino_width: int = 1024
     dino_depth: int = 24
     dino_heads: int = 16
@@ -35,6 +30,8 @@ class NetworkSizes(VisionSizes):
     llm_depth: int = 32
     llm_heads: int = 32
     llm_mlp: int = 11008
+    # rows of the embedding; `text_vocabulary`: those of the tokenizer. Action bins are the last `N_BINS
+    # - 1` of the latter, counted from behind.
     vocabulary: int = 32064
     text_vocabulary: int = 32000
     bos_token: int = 1

@@ -20,16 +20,13 @@ class NoOptions:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecurrentOptions:
-    """How a GRU or an LSTM remembers (docs/learning_the_rule.md).
+    """How a GRU or an LSTM remembers (docs/learning_the_rule.md)."""
 
-    Attributes:
-        keep_bias: added at the beginning to the bias of the gate that keeps the state (Gers et al. 2000,
-            "Learning to Forget"; of a GRU: its update gate). More of what was seen first is left then.
-        answers_before: the answer to a step is the state before it, normalised, in place of that after it.
-            The head reads the step itself anyway; so what was remembered is not mixed with it.
-    """
-
+    # added at the beginning to the bias of the gate that keeps the state (Gers et al. 2000, "Learning to
+    # Forget"; of a GRU: its update gate). More of what was seen first is left then.
     keep_bias: float = 0.0
+    # the answer to a step is the state before it, normalised, in place of that after it. The head reads
+    # the step itself anyway; so what was remembered is not mixed with it.
     answers_before: bool = False
 
     def __post_init__(self) -> None:

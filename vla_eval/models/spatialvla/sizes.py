@@ -28,16 +28,7 @@ TOKENS_PER_ACTION = 3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkSizes(VisionSizes):
-    """Sizes of all parts.
-
-    Attributes:
-        llm_own_head: 1: Gemma has an output matrix of its own, as published; 0: that of its input, as Gemma 2
-            itself and the golden files.
-        depth_px, depth_width, depth_layers, depth_heads, depth_mlp: ZoeDepth's encoder (BEiT); without
-            layers there is no depth model, and depth has to be given.
-        theta_bins, phi_bins, r_bins: of the translation's direction and length.
-        first_action_token: of the first action token; they are the last of the vocabulary.
-    """
+    """Sizes of all parts."""
 
     llm_width: int = 2304
     llm_depth: int = 26
@@ -45,7 +36,11 @@ class NetworkSizes(VisionSizes):
     llm_kv_heads: int = 4
     llm_head_width: int = 256
     llm_mlp: int = 9216
+    # 1: Gemma has an output matrix of its own, as published; 0: that of its input, as Gemma 2 itself and
+    # the golden files
     llm_own_head: int = 1
+    # `depth_px`, `depth_width`, `depth_layers`, `depth_heads`, `depth_mlp`: ZoeDepth's encoder (BEiT);
+    # without layers there is no depth model, and depth has to be given
     depth_px: int = 384
     depth_width: int = 1024
     depth_layers: int = 24
@@ -56,6 +51,7 @@ class NetworkSizes(VisionSizes):
     depth_features: int = 32
     depth_embedding: int = 128
     depth_bins: int = 64
+    # `theta_bins`, `phi_bins`, `r_bins`: of the translation's direction and length
     theta_bins: int = 16
     phi_bins: int = 32
     r_bins: int = 8
@@ -67,7 +63,7 @@ class NetworkSizes(VisionSizes):
     bos_token: int = 2
     newline_token: int = 108
     image_token: int = 257152
-    first_action_token: int = 257153
+    first_action_token: int = 257153  # of the first action token; they are the last of the vocabulary
 
     def __post_init__(self) -> None:
         VisionSizes.__post_init__(self)  # no super(): `slots` makes a new class of this one

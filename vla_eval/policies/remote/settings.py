@@ -21,17 +21,15 @@ Dialect = Literal["openpi", "vla_eval"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSettings:
-    """How the image of a camera is sent.
-
-    Attributes:
-        height_px, width_px: the size that the server wants; None: as the server says, else the camera's.
-        resize: how to make that size of another one: `pad` keeps the proportions and fills with black at two
-            sides, `plain` does not keep them. None: another size is an error.
-    """
+    """How the image of a camera is sent."""
 
     key: str
+    # `height_px`, `width_px`: the size that the server wants; None: as the server says, else the
+    # camera's
     height_px: int | None = None
     width_px: int | None = None
+    # how to make that size of another one: `pad` keeps the proportions and fills with black at two
+    # sides, `plain` does not keep them. None: another size is an error.
     resize: Literal["pad", "plain"] | None = None
 
     def __post_init__(self) -> None:

@@ -39,15 +39,12 @@ class PublishedRate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Board:
-    """Results that are listed together.
-
-    Attributes:
-        mean_over_tasks: whether the mean of all tasks is the figure that is compared; then it is computed
-            where a source states every task but no mean.
-    """
+    """Results that are listed together."""
 
     title: str
     tasks: tuple[str, ...]
+    # whether the mean of all tasks is the figure that is compared; then it is computed where a source
+    # states every task but no mean
     mean_over_tasks: bool
 
 

@@ -18,18 +18,14 @@ from vla_eval.tasks.objects.bodies import length, yaw_rad
 
 
 class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
-    """An environment whose arm can be held still, or moved by a script, whatever the action is.
+    """An environment whose arm can be held still, or moved by a script, whatever the action is."""
 
-    Attributes:
-        arm: the arm's row.
-        static_threshold_rad_s, freeze_until_choice, move_in_delay: see `MemoryTableEnv`.
-        executed_action: (B, A) the last action as it was carried out; None after a step without one.
-    """
-
-    arm: Arm
+    arm: Arm  # the arm's row
+    # `static_threshold_rad_s`, `freeze_until_choice`, `move_in_delay`: see `MemoryTableEnv`
     static_threshold_rad_s: float
     freeze_until_choice: bool
     move_in_delay: bool
+    # (B, A) the last action as it was carried out; None after a step without one
     executed_action: torch.Tensor | None
     _cue_end_step: torch.Tensor
     _response_step: torch.Tensor

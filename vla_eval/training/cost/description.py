@@ -19,17 +19,13 @@ class ModuleSize(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelDescription:
-    """The parts of a model, and the memory that weights, gradients and optimizer need.
+    """The parts of a model, and the memory that weights, gradients and optimizer need."""
 
-    Attributes:
-        modules: parts, largest first.
-        n_trained, n_parameters: of the whole model.
-        weights_bytes, training_bytes: what weights take; what gradients and optimizer add.
-    """
-
-    modules: tuple[ModuleSize, ...]
+    modules: tuple[ModuleSize, ...]  # parts, largest first
+    # `n_trained`, `n_parameters`: of the whole model
     n_trained: int
     n_parameters: int
+    # `weights_bytes`, `training_bytes`: what weights take; what gradients and optimizer add
     weights_bytes: int
     training_bytes: int
 

@@ -48,19 +48,15 @@ class Layer(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class Counted:
-    """What the layers of a network do with a sample.
+    """What the layers of a network do with a sample."""
 
-    Attributes:
-        forward, step: operations of a forward pass, and of a training step.
-        saved: numbers that the layers which gradients reach read and write, but for those computed again.
-        inputs: numbers from which layers are computed again.
-        working: numbers that the largest matrix reads and writes; `largest`: that the largest layer does.
-    """
-
+    # `forward`, `step`: operations of a forward pass, and of a training step
     forward: float = 0.0
     step: float = 0.0
+    # numbers that the layers which gradients reach read and write, but for those computed again
     saved: float = 0.0
-    inputs: float = 0.0
+    inputs: float = 0.0  # numbers from which layers are computed again
+    # numbers that the largest matrix reads and writes; `largest`: that the largest layer does
     working: float = 0.0
     largest: float = 0.0
 
