@@ -90,11 +90,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line and return the exit code.
-
-    Args:
-        argv: the arguments without the program's name; by default those of the process.
-    """
+    """Run the command line and return the exit code; `argv` is without the program's name."""
     leave_working_directory()
     with standard_streams():
         return _run(list(sys.argv[1:] if argv is None else argv))
@@ -139,11 +135,7 @@ def _run(arguments: list[str]) -> int:
 
 
 def build_parser(verbs: Sequence[str] = VERBS) -> argparse.ArgumentParser:
-    """Return the parser of the command line, with the arguments of these verbs.
-
-    Args:
-        verbs: the verbs whose modules are imported; a single one makes `mikasa-vla VERB` start faster.
-    """
+    """Return the parser of these verbs, whose modules are imported: a single one starts faster."""
     parser = _Parser(
         prog=PROGRAM,
         description="Evaluate vision-language-action policies on memory-intensive manipulation tasks.",

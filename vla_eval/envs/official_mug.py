@@ -39,12 +39,7 @@ READERS = "mikasa_robo_suite."
 
 
 def provide_mug(mug: object, *, task: str) -> str:
-    """Make the mug's files findable, and return what it is, for the run's description.
-
-    Args:
-        mug: `ycb` or `stand_in`.
-        task: for messages.
-    """
+    """Make the files of a mug, `ycb` or `stand_in`, findable; return what it is, for the run."""
     if mug not in (YCB, STAND_IN):
         raise TaskArgumentError(f"{task}: mug={mug!r}: expected '{YCB}' or '{STAND_IN}'.")
     if mug == STAND_IN:

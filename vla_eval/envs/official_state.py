@@ -55,13 +55,7 @@ class Candidates:
 
 
 def read_candidates(row: TaskSpec, env: Any, *, revealed: bool) -> Candidates | None:
-    """Return the candidates of the environment's episode; None for a task without.
-
-    Args:
-        row: the task.
-        env: its official environment, evaluated at this step.
-        revealed: whether the choice has begun.
-    """
+    """Return the candidates of an official environment, evaluated at this step; None for a task without."""
     if row.true_state == "items":
         names = _ITEMS[_family(row)]
         actors, places = _own(env, names.actors), _own(env, names.places)
@@ -78,11 +72,7 @@ def read_bodies(
 ) -> dict[str, BodyState]:
     """Return the moving objects and places that the family's expert reads, by its names for them.
 
-    Args:
-        row: the task.
-        env: its official environment, evaluated at this step.
-        candidates: what `read_candidates` has returned.
-        first: (N, 3) where the objects were at the start: the peg, or the mugs.
+    The environment is evaluated at this step; `first` (N, 3) is where peg or mugs were at the start.
     """
     if row.true_state == "ball":
         goal = {"goal": _place(_own(env, "goal_region"))} if hasattr(env, "goal_region") else {}

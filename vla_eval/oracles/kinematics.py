@@ -29,11 +29,7 @@ CLOSE = 1e-4  # m and rad: the inverse is found
 
 
 def joint_poses(qpos: ArrayLike) -> Matrix:
-    """Return (7, 4, 4): the frame of each joint, whose z is its axis.
-
-    Args:
-        qpos: joint positions, rad; the first seven are used.
-    """
+    """Return (7, 4, 4): the frame of each joint, whose z is its axis; of `qpos`, rad, seven are used."""
     pose, poses = np.eye(4), []
     arm_rad = np.asarray(qpos, dtype=float)[: len(CHAIN_M_RAD)]
     for angle_rad, (a_m, d_m, alpha_rad) in zip(arm_rad, CHAIN_M_RAD, strict=True):

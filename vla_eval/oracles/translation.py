@@ -28,16 +28,8 @@ SHARE_PER_STEP = FULL_SPEED_M_PER_STEP / DELTA_M
 def joint_target(mode: str, action: NDArray[np.float32], qpos: Vector) -> Vector:
     """Return the (7,) joint positions, rad, at which ManiSkill's controller aims.
 
-    Args:
-        mode: the control mode.
-        action: (A,) of that mode, the gripper last.
-        qpos: the present joint positions, rad; the first seven are the arm's.
-
-    Returns:
-        The present ones if a pose is out of reach, as in ManiSkill.
-
-    Raises:
-        UnknownNameError: there is no such mode.
+    `action` is (A,) of the mode, the gripper last; of `qpos`, rad, the first seven are the arm's. They are
+    returned if a pose is out of reach, as in ManiSkill.
     """
     arm = action_spec(mode).clipped(action)[:-1].astype(float)
     joints = np.array(qpos[:N_ARM_JOINTS], dtype=float)
@@ -59,19 +51,10 @@ def joint_target(mode: str, action: NDArray[np.float32], qpos: Vector) -> Vector
 
 
 def command(mode: str, target_rad: Vector, gripper: float, qpos: Vector) -> NDArray[np.float32]:
-    """Return the action of a mode that aims at joint positions.
+    """Return the action of a mode that aims at joint positions (7,), rad, from those of `qpos`.
 
     A delta mode goes as far towards them as its bounds allow, and `pd_ee_delta_pos` leaves the orientation
-    as it is.
-
-    Args:
-        mode: the control mode.
-        target_rad: (7,).
-        gripper: the last number of the action.
-        qpos: the present joint positions, rad.
-
-    Raises:
-        UnknownNameError: there is no such mode.
+    as it is. `gripper` is the last number.
     """
     action_spec(mode)
     if mode == JOINT_POS:
@@ -95,16 +78,10 @@ def _tool_command(mode: str, target_rad: Vector, qpos: Vector) -> Vector:
 
 
 def translated(rows: NDArray[np.float32], mode: str, qpos: Vector, qvel: Vector) -> NDArray[np.float32]:
-    """Return a chunk of `pd_ee_delta_pose` as one of another mode.
+    """Return a chunk (T, 7) of `pd_ee_delta_pose` as one of another mode.
 
     What an action means depends on where the arm will be by then, which is predicted with the model of
-    the arm that the experts plan with, applied to its joints.
-
-    Args:
-        rows: (T, 7).
-        mode: the other mode.
-        qpos: the present joint positions, rad; the first seven are the arm's.
-        qvel: their velocities, rad/s.
+    the arm that the experts plan with, applied to its joints: `qpos`, rad, and `qvel`, rad/s.
     """
     joints = np.array(qpos[:N_ARM_JOINTS], dtype=float)
     step_rad = np.array(qvel[:N_ARM_JOINTS], dtype=float) * STEP_SECONDS

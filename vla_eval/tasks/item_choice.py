@@ -114,12 +114,7 @@ class ItemChoiceEnv(ChoiceEnv):
             self.move(decoy, mask, self._decoy_parking_pose(item))
 
     def _sample_distractor(self, env: int, excluded: Collection[int]) -> None:
-        """Draw the item that distracts, after the cue has been drawn.
-
-        Args:
-            env: the parallel environment.
-            excluded: the items that are right, and those that the drawn cue shows.
-        """
+        """Draw the item that distracts, after the cue: none that is right, or that the drawn cue shows."""
         if self.distract_steps:
             others = [index for index in range(self.n_items) if index not in excluded]
             drawn = self.episode_generator(env, Stream.DISTRACTOR).integers(len(others))
@@ -139,13 +134,7 @@ class ItemChoiceEnv(ChoiceEnv):
         return begins | ends
 
     def _show_in_middle(self, mask: torch.Tensor, drawn: torch.Tensor, shown: torch.Tensor) -> None:
-        """Move items to the centre of the table where the mask holds.
-
-        Args:
-            mask: (B,) bool.
-            drawn: (B,) indices of the items to move.
-            shown: (B,) indices of the items to be seen there; others than `drawn` if the cue is swapped.
-        """
+        """Move items (B,) to the table's centre where (B,) holds; `shown` are seen if the cue is swapped."""
         if not bool(mask.any()):
             return
         for index, item in enumerate(self.items):

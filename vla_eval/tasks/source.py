@@ -25,12 +25,9 @@ class TaskArgument(NamedTuple):
 
 @cache
 def task_arguments(entry_point: str) -> tuple[TaskArgument, ...]:
-    """Return the keyword arguments of a task's class and of its bases, nearest first.
+    """Return the keyword arguments of a task's class, `module:Class`, and of its bases, nearest first.
 
     What a class itself gives to its base is not one of them. Empty if the class has no source to read.
-
-    Args:
-        entry_point: `module:Class`, as in the task's row.
     """
     found: list[TaskArgument] = []
     seen = set(NOT_FOR_USERS)

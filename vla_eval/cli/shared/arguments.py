@@ -200,17 +200,10 @@ def read_config[T](
     needed: Mapping[str, str],
     example: str,
 ) -> T:
-    """Return a configuration: the file, or what stands for it, with the flags on top.
+    """Return a configuration: the file `name`, or the fields `start` in its place, with the flags on top.
 
-    Args:
-        cls: its dataclass.
-        edit: puts the flags on top.
-        folder: where configurations of this kind are.
-        name: the file; None: none was named.
-        start: fields that stand for a file.
-        asks: what to name where neither a file nor enough flags are given.
-        needed: field -> flag that must be there without a file.
-        example: a command.
+    Without a file, each field in `needed` must be there; else a message names its flag, what is asked for,
+    and an `example`.
     """
     from vla_eval.tasks.catalog import with_version
 
@@ -249,15 +242,7 @@ def add_old_flag(
     kind: Callable[[str], Any] = str,  # Any: what the flag's values are read as
     nargs: str | None = None,
 ) -> None:
-    """Let a flag also be typed by its old name, which no help shows.
-
-    Args:
-        parser: has the new flag already.
-        old: `--record-video`.
-        new: `--capture-video`.
-        kind: argparse's `type`, as the new flag has it.
-        nargs: argparse's, as the new flag has it.
-    """
+    """Let a flag, which the parser has, also be typed by its old name, which no help shows."""
     parser.add_argument(
         old,
         dest=new.removeprefix("--").replace("-", "_"),

@@ -19,10 +19,8 @@ def backend_of(
 ) -> Iterator[Backend]:
     """Give what `--cluster` names; without it, this machine.
 
-    Args:
-        args: of the command line.
-        needs: returns the files that each machine of a cluster must have; called if there is a cluster.
-        notes_kinds: whether results say what kind of machine they are from; else there must be one kind.
+    `needs` returns the files that each machine of a cluster must have. Where results do not note the kind of
+    machine they are from (`notes_kinds`), there must be one kind.
     """
     if args.cluster is None:
         yield LOCAL

@@ -39,14 +39,10 @@ def evaluate_one(
 def evaluate_each(
     runs: Iterable[tuple[Path, EvalConfig]], args: argparse.Namespace, *, backend: Backend
 ) -> Evaluations:
-    """Run or resume each evaluation; a signal stops the one that runs, and those after it.
+    """Run or resume each evaluation, (run folder, configuration); a signal stops it and those after it.
 
-    One that another process is writing comes after all others, so that several processes share the work.
-
-    Args:
-        runs: run folder and configuration of each.
-        args: of the command line: `--shard`, `--allow-environment-change` and `--json-progress`.
-        backend: where the workers run.
+    One that another process is writing comes after all others, so that several processes share the work. Of
+    `args`: `--shard`, `--allow-environment-change` and `--json-progress`.
     """
     n_errors = 0
     put_off: list[tuple[Path, EvalConfig]] = []

@@ -17,12 +17,7 @@ LINE_EVERY_SECONDS = 60.0
 
 
 class EpisodeBar:
-    """Shows on standard error how many episodes are done, and the remaining time at this rate.
-
-    Args:
-        clock: seconds that only grow.
-        is_quiet: write nothing: standard error is for another program.
-    """
+    """Shows on standard error how many episodes are done, and the time left; `is_quiet` writes nothing."""
 
     def __init__(self, *, clock: Callable[[], float] = time.monotonic, is_quiet: bool = False) -> None:
         self._clock = clock
@@ -66,12 +61,7 @@ class EpisodeBar:
                 self._redraw()
 
     def load(self, text: str, *, n_steps: int | None) -> None:
-        """Show what the workers are doing.
-
-        Args:
-            text: for a person; empty: nothing.
-            n_steps: control steps of the episodes under way; None: not known.
-        """
+        """Show what the workers are doing, and the steps of episodes under way; None: not known."""
         self._load, self._n_running_steps = text, n_steps or 0
         if self._bar is not None and (self._n_done > self._n_before or n_steps):
             self._redraw()

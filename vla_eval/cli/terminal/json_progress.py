@@ -29,12 +29,7 @@ EVERY_SECONDS = 1.0  # between two lines `progress`
 
 
 class JsonLines:
-    """Writes lines to a file descriptor; a reader that is gone does not stop the run.
-
-    Args:
-        descriptor: an open file descriptor; None: nothing is written.
-        clock: seconds that only grow.
-    """
+    """Writes lines to a file descriptor, if any; a reader that is gone does not stop the run."""
 
     def __init__(self, descriptor: int | None, *, clock: Callable[[], float] = time.monotonic) -> None:
         self.descriptor = descriptor

@@ -50,10 +50,7 @@ class StopRequest:
 def stop_on_signals(answer: str = "") -> Iterator[StopRequest]:
     """Turn Ctrl-C, SIGTERM and SIGHUP into a request, so that no record is cut in the middle.
 
-    A second signal does not wait: it raises KeyboardInterrupt.
-
-    Args:
-        answer: to the first one, a line on standard error.
+    The first one gets the `answer` on standard error; a second one raises KeyboardInterrupt.
     """
     request = StopRequest()
 
@@ -113,12 +110,7 @@ def capture_cost(capture: CaptureConfig) -> str:
 
 
 def load_text(load: Load, *, n_open: int) -> str:
-    """Return what the machines of a cluster are doing, for a person; nothing for this machine alone.
-
-    Args:
-        load: of all workers.
-        n_open: episodes that have no result yet.
-    """
+    """Return what a cluster's machines do, and how many episodes wait; nothing for this machine alone."""
     if not load.machines:
         return ""
     used = [machine for machine in load.machines if machine.is_used]

@@ -19,11 +19,7 @@ UNBROKEN = re.compile(r"\S*`[^`]+`\S*|(?<=: )mikasa-vla .*|\S+")
 
 
 def screen_width(*, widest: int | None = WIDEST) -> int | None:
-    """Return how many characters a printed line may have; None where standard output is not a terminal.
-
-    Args:
-        widest: a table may take the whole terminal: None.
-    """
+    """Return how wide a printed line may be (a table: `widest` None); None where output is not a terminal."""
     if not sys.stdout.isatty():
         return None
     columns = shutil.get_terminal_size((WIDEST, UNKNOWN_LINES)).columns

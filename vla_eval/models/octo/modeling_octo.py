@@ -87,12 +87,9 @@ class MikasaOctoPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is un
     def predict_action_chunk(
         self, batch: dict[str, Tensor], noise: Tensor | None = None, **kwargs: Any
     ) -> Tensor:
-        """Return (B, chunk, action), normalised.
+        """Return (B, chunk, action), normalised, of images (B, W, 3, H, W') and tokens of the instruction.
 
-        Args:
-            batch: images (B, W, 3, H, W'), `FIELD_is_pad` (B, W), tokens of the instruction.
-            noise: (B, *config.noise_shape); None: from torch's global generator.
-            kwargs: lerobot's; not used.
+        `noise` is (B, *config.noise_shape); None: from torch's global generator.
         """
         self.eval()
         readout_BD = self._readout(batch)[:, -1]

@@ -58,12 +58,9 @@ def check_lora_target(target: str | None) -> None:
 
 
 def check_lora(model: Any, target: str, full_modules: Sequence[str] = ()) -> tuple[str, ...]:
-    """Check that what is trained is the adapters of the named modules, and the modules trained in full.
+    """Check that what is trained is the adapters that `target` names, and `full_modules` by last names.
 
-    Args:
-        model: peft's wrapper around the policy.
-        target: regular expression of the modules that have an adapter, whose names are returned.
-        full_modules: last parts of the names of modules that are trained in full (`modules_to_save`).
+    `model` is peft's wrapper around the policy; the names of the modules with an adapter are returned.
     """
     check_lora_target(target)
     inner = model.get_base_model() if hasattr(model, "get_base_model") else model

@@ -66,14 +66,9 @@ def visible(n_triangles: int) -> NDArray[np.bool_]:
 
 
 def snap_to_grid(triangles: FloatArray, grid_m: float) -> FloatArray:
-    """Simplify a triangle soup by moving vertices to the mean of their grid cell.
+    """Simplify triangles (T, 3, 3), m, by moving vertices to the mean of their grid cell.
 
-    Args:
-        triangles: (T, 3, 3) float32 corner positions in m.
-        grid_m: edge of a cell.
-
-    Returns:
-        (T', 3, 3) float32, without triangles that collapsed and without duplicates, in a fixed order.
+    The result has no triangles that collapsed and no duplicates, in a fixed order.
     """
     corners = triangles.reshape(-1, 3).astype(np.float64)
     _, cell_of_corner = np.unique(np.floor(corners / grid_m).astype(np.int64), axis=0, return_inverse=True)

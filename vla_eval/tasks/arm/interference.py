@@ -19,14 +19,9 @@ class Motion(NamedTuple):
 
 
 def delay_motion(step: int, *, begins: int, ends: int) -> Motion | None:
-    """Return the motion of a control step, or None outside the delay.
+    """Return the motion of a control step of the delay, [begins, ends), or None outside of it.
 
     As many steps lead out as back, so that the arm ends about where it was.
-
-    Args:
-        step: control steps executed so far.
-        begins: the first step of the delay.
-        ends: the first step after it.
     """
     if not begins <= step < ends:
         return None

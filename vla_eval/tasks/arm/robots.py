@@ -31,14 +31,10 @@ _CAMERA_MESH = "realsense2_description/meshes/d415.stl"
 
 @functools.cache  # asked for at each reset, and the sources have 21 MB
 def changed_urdf(name: str, change: MeshChange) -> Path:
-    """Return the URDF of the Panda with a changed camera mesh; create it if it is not in the cache.
+    """Return the URDF of a variant of the Panda with a changed camera mesh, from the cache or new in it.
 
     The folder's name is a digest of its sources. It is created atomically by a rename, so workers that
     start together cannot see a partial file.
-
-    Args:
-        name: of the variant, for the files.
-        change: returns the triangles to draw.
     """
     source_urdf, stl = _PANDA_DIR / "panda_v3.urdf", (_PANDA_DIR / _CAMERA_MESH).read_bytes()
     digest = hashlib.sha256(f"{name} {GRID_M} {_PANDA_DIR}".encode() + source_urdf.read_bytes())

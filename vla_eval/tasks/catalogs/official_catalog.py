@@ -44,11 +44,7 @@ _N_MUGS = 3
 
 
 def control_fields(name: str) -> dict[str, Any]:
-    """Return the fields of a catalogue row that its controls need; empty if there are none.
-
-    Args:
-        name: of the task, such as `RememberColor3-VLA-v0`.
-    """
+    """Return what the controls of a task (`RememberColor3-VLA-v0`) need of a row; empty if there are none."""
     task = name.partition("-")[0]
     for prefix, controls in _CHOICES.items():
         if task.startswith(prefix):
@@ -116,12 +112,10 @@ MIKASA_VLA_90 = _read_table()
 
 
 def original_tasks(rows: Iterable[TaskSpec]) -> dict[str, TaskSpec]:
-    """Return the package's original tasks: those of the paper, of which this package has its own versions.
+    """Return the package's original tasks: those of the paper, of which `rows` are this package's versions.
 
-    Left out are the tasks with a peg: the angle asked for is in none of the official observations.
-
-    Args:
-        rows: this package's tasks; ids, horizons and sentences are the same.
+    Ids, horizons and sentences are the same. Left out are the tasks with a peg: the angle asked for is in
+    none of the official observations.
     """
     found = (
         replace(

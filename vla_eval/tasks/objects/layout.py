@@ -44,13 +44,10 @@ def slot_centres_m(n_items: int) -> Plane:
 
 
 def places_from_right(positions_m: Plane) -> tuple[int, ...]:
-    """Return the place of each object: 0 is the rightmost as the robot sees it.
+    """Return the place of each object (N, 2), world frame: 0 is the rightmost as the robot sees it.
 
     Counted by the angle about the centre of the arc: the outermost places of an arc of nine differ by 1 cm
     in y, which is the jitter, but by more than 20 degrees.
-
-    Args:
-        positions_m: (N, 2) xy, world frame.
     """
     angles = np.arctan2(positions_m[:, 1], positions_m[:, 0] - ARC_CENTRE_X_M)
     order = np.argsort(angles, kind="stable")

@@ -22,13 +22,7 @@ class _Busy(NamedTuple):
 
 
 class ClusterService:
-    """An actor with a guarded process; see `Service`.
-
-    Args:
-        index: which of the services it is.
-        has_gpu: whether a GPU is reserved for it; Ray then sets `CUDA_VISIBLE_DEVICES`.
-        address: IP address to bind.
-    """
+    """An actor with a guarded process, see `Service`; for a GPU, Ray sets `CUDA_VISIBLE_DEVICES`."""
 
     gpu: str | None = None
 
