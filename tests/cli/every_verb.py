@@ -25,6 +25,7 @@ FINETUNE = (
 
 # In this order: later ones use what earlier ones leave in {W}.
 COMMANDS = {
+    "init": "init {W}/own.yaml",
     "record": f"record --task {TASK} RememberShape3-v0 --episodes 2 {FAKE} --out {{W}}/data",
     "replay": "replay {W}/data --workers 1",
     "eval": f"{EVAL} --out {{W}}/run",

@@ -22,6 +22,7 @@ from vla_eval.errors import VlaEvalError
 
 TASK = "RememberColor3-v0"
 NEEDED: dict[tuple[str, ...], str] = {
+    ("init",): "own.yaml",
     ("eval",): f"--task {TASK} --policy oracle --set simulator=fake",
     ("report",): "nothing",
     ("merge",): "nothing --out new",

@@ -15,6 +15,7 @@ HEAVY = (*("torch", "lerobot", "transformers", "datasets", "mani_skill", "sapien
 MOST_CPU_SECONDS = 2.0
 # Verb -> command lines, each with a word that the message must have.
 MISTAKES: dict[str, dict[str, str]] = {
+    "init": {"init own": "ends in .yaml", "init nowhere/own.yaml": "no folder 'nowhere'"},
     "eval": {
         "eval nowhere": "nowhere",
         f"eval --task RememberColour3-v0 --policy oracle {FAKE}": "RememberColour3-v0",

@@ -3,7 +3,7 @@
 import argparse
 import contextlib
 import sys
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import (
     add_flags,
@@ -22,6 +22,9 @@ from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.model_table import is_model_table
 from vla_eval.strict.decoding import set_field
+
+if TYPE_CHECKING:
+    from vla_eval.training.request import FinetuneSummary
 
 DESCRIPTION = """Train a policy on a dataset, by the recipe in policies/NAME.yaml.
 
@@ -122,8 +125,7 @@ def run(args: argparse.Namespace) -> int:
     finished = finished_run(config)
     if finished is not None:
         print(finished, file=sys.stderr)
-        print(finished.checkpoint)
-        return 0
+        return _done(finished)
     # Here and not above: what is finished need not wait for torch.
     from tqdm import tqdm
 
@@ -141,7 +143,18 @@ def run(args: argparse.Namespace) -> int:
     if not summary.is_finished:
         print(f"Stopped at step {summary.step} in {summary.out}. To resume: {command}", file=sys.stderr)
         return stop.exit_code
-    print(summary.checkpoint)
+    return _done(summary)
+
+
+def _done(summary: "FinetuneSummary") -> int:
+    """Print the checkpoint, and the command that evaluates it."""
+    from vla_eval.checkpoints.files import read_facts
+    from vla_eval.cli.shared.output import hint_next
+
+    print(summary.checkpoint, flush=True)
+    facts = read_facts(summary.checkpoint)
+    tasks = [facts.task] if facts is not None and facts.task else list(facts.tasks if facts else ())
+    hint_next("eval", "--task", *(tasks or ["TASK"]), "--policy", summary.out, "cue_blind", "oracle")
     return 0
 
 

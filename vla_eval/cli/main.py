@@ -22,6 +22,7 @@ from vla_eval.workers.children import leave_working_directory
 
 PROGRAM = "mikasa-vla"
 VERBS = (
+    "init",
     "eval",
     "report",
     "merge",

@@ -67,7 +67,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 def run(args: argparse.Namespace) -> int:
     """Record and replay; the datasets' names go to standard output, everything else to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for lerobot.
-    from vla_eval.cli.shared.output import hint_merge
+    from vla_eval.cli.shared.output import hint_merge, hint_next
     from vla_eval.cli.terminal.progress import stop_on_signals
     from vla_eval.cli.terminal.recording_progress import RecordingProgress
     from vla_eval.data.recording.record import record
@@ -103,6 +103,10 @@ def run(args: argparse.Namespace) -> int:
         code = _replay_new(summary, args, stop, workers=recipe.workers, backend=backend)
     if stop.is_asked:
         print(f"Stopped in the replay check. To resume: {command}", file=sys.stderr)
+    elif code == 0 and summary.datasets:
+        path = summary.datasets[0].path
+        before = ("replay",) if args.no_replay else ("finetune", "--policy", "act", "--dataset")
+        hint_next(*before, path)
     return code
 
 

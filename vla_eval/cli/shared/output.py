@@ -1,6 +1,7 @@
 """Tables and pages of an evaluation, as its verbs print and write them."""
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -109,6 +110,11 @@ def hint_merge(whole: Path, shard: Shard) -> None:
         f"--out {whole}; then the same command without --shard prints the result.",
         file=sys.stderr,
     )
+
+
+def hint_next(*words: object) -> None:
+    """Say on standard error which command comes next."""
+    print(f"Next: {shlex.join(['mikasa-vla', *map(str, words)])}", file=sys.stderr)
 
 
 def check_baseline(baseline: str | None, policies: Sequence[str]) -> None:
