@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[2]
 PLUGIN = ROOT / "plugins" / "mikasa_vla_client"
 PACKAGE = PLUGIN / "mikasa_vla_client"
-LINKED = ("codec.py", "check.py", "check_client.py", "keys.py", "numbers.py")
+LINKED = ("codec.py", "check.py", "check_client.py", "keys.py", "noise.py", "numbers.py")
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """The kit in `vla_eval.testing`: ours pass it, and it notices each kind of broken promise."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -9,7 +9,7 @@ import pytest
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
-from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, ObservationWindow, StepResult
+from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, ImageArray, ObservationWindow, StepResult
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import ConformanceError
 from vla_eval.policies.context import PolicyContext
@@ -167,8 +167,97 @@ class NotANumberLater:
 
 def test_a_number_that_is_not_finite_is_named_by_row_dimension_and_step() -> None:
     env: Any = make_env(FAKE)
-    # Chunks of two actions: the second one begins at step 2. The first episode of the check has seed 2.
+    # Chunks of two actions: the second one begins at step 2. The first episode of the check has seed 0.
     with pytest.raises(
-        ConformanceError, match=r"nan in row 1, dimension 'dz', of the chunk at step 2 \(seed 2\)"
+        ConformanceError, match=r"nan in row 1, dimension 'dz', of the chunk at step 2 \(seed 0\)"
     ):
         check_policy(NotANumberLater, env.spec)
+
+
+def _patch_is_right(image: ImageArray) -> bool:
+    brightness = image.mean(axis=(0, 2))
+    half = len(brightness) // 2
+    return bool(brightness[:half].mean() < brightness[half:].mean())
+
+
+# What is left of an observation is one bit: a policy that compares two things, or counts cubes of a colour.
+BITS: dict[str, Callable[[ImageArray, FloatArray, str], bool]] = {
+    "more red than green": lambda image, _state, _sentence: image[..., 0].mean() > image[..., 1].mean(),
+    "more green than blue": lambda image, _state, _sentence: image[..., 1].mean() > image[..., 2].mean(),
+    "bright": lambda image, _state, _sentence: image.mean() > 105,
+    "a place": lambda image, _state, _sentence: _patch_is_right(image),
+    "a colour at a place": lambda image, _state, _sentence: (
+        (image[..., 0].mean() > image[..., 1].mean()) != _patch_is_right(image)
+    ),
+    "the sign of one joint": lambda _image, state, _sentence: state[0] > 0,
+    "the sign of the next": lambda _image, state, _sentence: state[1] > 0,
+    "the sentence": lambda _image, _state, sentence: "red" in sentence,
+}
+MEMORIES: dict[str, Callable[[list[bool]], bool]] = {
+    "the first": lambda seen: seen[0],
+    "the one before": lambda seen: seen[-2] if len(seen) > 1 else False,
+    "the majority": lambda seen: sum(seen) * 2 > len(seen),
+    "how often": lambda seen: sum(seen) % 2 == 1,
+    "the tenth": lambda seen: seen[9] if len(seen) > 9 else False,
+}
+
+
+class OneBit:
+    """Acts on one remembered bit; the memory is of the slot, or one for all slots."""
+
+    def __init__(self, bit: str, memory: str, *, is_shared: bool, chunk_size: int = 1) -> None:
+        self.spec = PolicySpec(
+            name="bit", reads="last", cameras=("base_camera",), states=("qpos",), chunk_size=chunk_size
+        )
+        self._bit, self._memory, self._is_shared = BITS[bit], MEMORIES[memory], is_shared
+        self._seen: dict[int, list[bool]] = {}
+        self._sentences: dict[int, str] = {}
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        for episode in episodes:
+            self._seen[self._place(episode.slot)] = []
+            self._sentences[self._place(episode.slot)] = episode.instruction
+
+    def _place(self, slot: int) -> int:
+        return 0 if self._is_shared else slot
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        seen = self._seen[self._place(window.slot)]
+        image, state = window.last.images["base_camera"], window.last.state["qpos"]
+        seen.append(bool(self._bit(image, state, self._sentences[self._place(window.slot)])))
+        value = float(self._memory(seen))
+        return ActionChunk(actions=np.full((self.spec.chunk_size, 7), value, dtype=np.float32))
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+@pytest.mark.parametrize("bit", BITS)
+def test_one_memory_for_all_slots_is_noticed_whatever_is_left_of_an_observation(
+    bit: str, memory: str
+) -> None:
+    env: Any = make_env(FAKE)
+    check_policy(lambda: OneBit(bit, memory, is_shared=False), env.spec)
+    with pytest.raises(ConformanceError, match=r"Keep your state by `window\.slot`"):
+        check_policy(lambda: OneBit(bit, memory, is_shared=True), env.spec)
+
+
+@pytest.mark.parametrize("chunk_size", [4, 8])
+@pytest.mark.parametrize("memory", ["the first", "the one before", "how often"])
+@pytest.mark.parametrize("bit", BITS)
+def test_it_is_noticed_in_longer_chunks(bit: str, memory: str, chunk_size: int) -> None:
+    env: Any = make_env(FAKE)
+    with pytest.raises(ConformanceError, match=r"Keep your state by `window\.slot`"):
+        check_policy(lambda: OneBit(bit, memory, is_shared=True, chunk_size=chunk_size), env.spec)
+
+
+def test_a_policy_that_knows_one_sentence_is_checked_with_it_and_that_is_said() -> None:
+    class KnowsOne(OneBit):
+        def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+            for episode in episodes:
+                {"pick up the red cube": 0}[episode.instruction]
+            super().reset(episodes)
+
+    env: Any = make_env(FAKE)
+    met = check_policy(lambda: KnowsOne("bright", "the first", is_shared=False), env.spec)
+    assert any(line.startswith("Not tried: episodes with different sentences") for line in met)
+    with pytest.raises(ConformanceError, match="Keep your state"):
+        check_policy(lambda: KnowsOne("bright", "the first", is_shared=True), env.spec)

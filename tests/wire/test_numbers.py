@@ -5,7 +5,8 @@ import pytest
 
 from tests.wire.hostile_numbers import hostile_vectors
 from vla_eval.features import STATE_NAMES, rotation_columns
-from vla_eval.wire.numbers import NumbersError, as_state, noise_state
+from vla_eval.wire.noise import SEEDS, look_at, noise_state
+from vla_eval.wire.numbers import NumbersError, as_state
 
 QUATERNIONS = {
     "zero": (0, 0, 0, 0),
@@ -76,5 +77,15 @@ def test_a_rotation_may_be_rounded_to_two_decimals_and_have_any_sign() -> None:
 @pytest.mark.parametrize("kind", ["joints", "eef"])
 def test_noise_is_a_state(kind: str) -> None:
     for seed in range(100):
-        noise = noise_state(np.random.default_rng(seed), STATE_NAMES[kind])  # type: ignore[index]
+        noise = noise_state(np.random.default_rng(seed), seed % 4, STATE_NAMES[kind])  # type: ignore[index]
         np.testing.assert_array_equal(as_state(noise, STATE_NAMES[kind]), noise)  # type: ignore[index]
+
+
+@pytest.mark.parametrize("chunk_size", [1, 2, 4, 8, 50])
+def test_episodes_of_a_check_look_different_at_each_step_and_in_all_ways_within_four_inferences(
+    chunk_size: int,
+) -> None:
+    for step in range(4 * chunk_size):
+        assert {look_at(seed, step, chunk_size) for seed in SEEDS} == {0, 1, 2, 3}
+    for seed in SEEDS:
+        assert {look_at(seed, k * chunk_size, chunk_size) for k in range(4)} == {0, 1, 2, 3}

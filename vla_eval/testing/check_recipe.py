@@ -62,7 +62,8 @@ def check_recipe(
         report=report,
     )
     watch = SentenceWatch(group.part)
-    for reading in first.readings.values() if isinstance(first, ReadingPolicy) else ():
+    readings = first.readings.values() if isinstance(first, ReadingPolicy) else ()
+    for reading in (one for one in readings if one.sentence == group.instruction):
         for line in watch.lines(reading, group.key.task):
             say(f"warning: {line}")
     return met

@@ -24,6 +24,7 @@ from .check_client import (
     run_episodes,
     shown,
 )
+from .noise import PAIRS, SEEDS
 
 __all__ = ["CheckFailedError", "check_remote"]
 
@@ -163,7 +164,7 @@ def _metadata(server: Server) -> list[str]:
 
 
 def _chunks(server: Server) -> list[str]:
-    for seed in (1, 2):
+    for seed in SEEDS:
         with server.connect() as connection:
             (server.alone[seed],) = run_episodes([Episode(server, connection, seed)])
     shape = (server.facts.chunk_size, server.facts.n_dims)
@@ -193,15 +194,19 @@ def _seeds(server: Server) -> list[str]:
 def _sessions(server: Server) -> list[str]:
     claims = []
     for n_connections, where in ((1, "on one connection"), (2, "on two connections")):
-        connections = [server.connect() for _ in range(n_connections)]
-        episodes = [Episode(server, connections[0], 2, "a"), Episode(server, connections[-1], 1, "b")]
         requirement = f"Two sessions side by side {where} get what each gets alone."
-        try:
-            for seed, chunks in zip((2, 1), run_episodes(episodes)):
-                _expect_same(server, chunks, seed, requirement, BY_SESSION)
-        finally:
-            for connection in connections:
-                connection.close()
+        for pair in PAIRS:
+            connections = [server.connect() for _ in range(n_connections)]
+            episodes = [
+                Episode(server, connections[0], pair[0], "a"),
+                Episode(server, connections[-1], pair[1], "b"),
+            ]
+            try:
+                for seed, chunks in zip(pair, run_episodes(episodes)):
+                    _expect_same(server, chunks, seed, requirement, BY_SESSION)
+            finally:
+                for connection in connections:
+                    connection.close()
         claims.append(requirement)
     return claims
 

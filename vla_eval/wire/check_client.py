@@ -17,11 +17,10 @@ from websockets.sync.client import connect
 
 from .codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb  # relative: the file is in two packages
 from .keys import key_headers, key_problem
-from .numbers import noise_state
+from .noise import ROWS, look_at, n_inferences, noise_image, noise_state
 
-N_INFERENCES = 3
 HORIZON_STEPS = 60
-PROMPT, TASK = "pick up the red cube", "RememberColor3-v0"
+PROMPTS, TASK = ("pick up the red cube", "touch the cube that was shown"), "RememberColor3-v0"
 
 Message = Dict[str, Any]  # Any: whatever a message may hold
 Chunks = List["np.ndarray[Any, Any]"]
@@ -50,14 +49,14 @@ class Facts:
     supports: Sequence[str]
 
     def observation(self, seed: int, step: int, layout: str | None = None) -> Message:
-        """Return noise in the announced shapes."""
+        """Return noise in the announced shapes, see `noise.py`."""
         rng = np.random.default_rng((seed, step))
-        sizes = self.cameras.items()
-        frame: Message = {key: rng.integers(0, 256, (*size, 3), dtype=np.uint8) for key, size in sizes}
+        look = look_at(seed, step, self.chunk_size)
+        frame: Message = {key: noise_image(rng, look, *size) for key, size in self.cameras.items()}
         if self.state_key is not None and self.layouts:
             names = self.layouts[layout or next(iter(self.layouts))]
-            frame[self.state_key] = noise_state(rng, names)
-        return {**frame, self.prompt_key: PROMPT}
+            frame[self.state_key] = noise_state(rng, look, names)
+        return {**frame, self.prompt_key: PROMPTS[seed % 2]}
 
 
 class Server:
@@ -180,13 +179,14 @@ class Episode:
         self._server, self._facts, self._connection = server, server.facts, connection
         self._seed, self._session_id = seed, session_id
         self._next = 0
+        self.chunk_size: int = self._facts.chunk_size
         self.chunks: Chunks = []
 
     def begin(self) -> None:
         """Reset the session."""
         facts: Message = {"task": TASK, "seed": self._seed, "run": 0, "horizon_steps": HORIZON_STEPS}
-        row = {"row": self._seed % self._facts.batch_max} if "row" in self._facts.supports else {}
-        about = {self._facts.prompt_key: PROMPT, **facts, **row}
+        row = {"row": ROWS[self._seed] % self._facts.batch_max} if "row" in self._facts.supports else {}
+        about = {self._facts.prompt_key: PROMPTS[self._seed % 2], **facts, **row}
         self._connection.send({"endpoint": "reset", "session_id": self._session_id, **about})
         reply = self._reply()
         self._server.expect(
@@ -228,10 +228,11 @@ class Episode:
 
 def run_episodes(episodes: Sequence[Episode]) -> list[Chunks]:
     """Run episodes side by side, all requests of a round before its replies; each begins a round later."""
-    for turn in range(N_INFERENCES + len(episodes) - 1):
+    n_asked = n_inferences(episodes[0].chunk_size)
+    for turn in range(n_asked + len(episodes) - 1):
         if turn < len(episodes):
             episodes[turn].begin()
-        running = [one for k, one in enumerate(episodes) if k <= turn < k + N_INFERENCES]
+        running = [one for k, one in enumerate(episodes) if k <= turn < k + n_asked]
         for episode in running:
             episode.ask()
         for episode in running:

@@ -41,16 +41,8 @@ def as_state(value: Any, names: Sequence[str]) -> np.ndarray[Any, Any]:
     return state
 
 
-def noise_state(generator: np.random.Generator, names: Sequence[str]) -> np.ndarray[Any, Any]:
-    """Return a state of noise, (len(names),) float32 in [-1, 1], with rotations of length 1."""
-    state: np.ndarray[Any, Any] = generator.uniform(-1, 1, len(names)).astype(np.float32)
-    for _, places in _unit_vectors(names):
-        state[places] /= np.linalg.norm(state[places])
-    return state
-
-
 def _check_rotations(state: np.ndarray[Any, Any], names: Sequence[str]) -> None:
-    for group, places in _unit_vectors(names):
+    for group, places in unit_vectors(names):
         vector = state[places].astype(np.float64)
         length = float(np.linalg.norm(vector))
         if abs(length - 1) > MAX_LENGTH_ERROR:
@@ -61,7 +53,7 @@ def _check_rotations(state: np.ndarray[Any, Any], names: Sequence[str]) -> None:
             )
 
 
-def _unit_vectors(names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], list[int]]]:
+def unit_vectors(names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], list[int]]]:
     """Yield the groups of which all names are there, and their places."""
     places = {name: place for place, name in enumerate(names)}
     for group in UNIT_VECTORS:

@@ -1,0 +1,1 @@
+../../../vla_eval/wire/noise.py
