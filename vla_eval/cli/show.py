@@ -65,13 +65,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Explain what is named, without starting a simulator.
-
-    Raises:
-        UnknownNameError: there is nothing of this name; the message suggests the closest one of all kinds.
-        RunFolderError: it is a folder, but neither of a run, a training, a dataset nor a checkpoint.
-        RecipeError: it is a recipe that cannot be read.
-    """
+    """Explain what is named, without starting a simulator."""
     if find_task(args.name) is None:
         return _show_folder(Path(args.name)) if os.path.isdir(args.name) else _show_recipes(args.name)
     spec = task_spec(args.name)
@@ -136,11 +130,7 @@ def _show_recipes(name: str) -> int:
 
 
 def _kind_of_file(name: str) -> Folder:
-    """Return which kind of recipe has all the fields of a file.
-
-    Raises:
-        RecipeError: none has.
-    """
+    """Return which kind of recipe has all the fields of a file."""
     given = recipe_fields("configs", name)
     for folder, kind in KINDS.items():
         for cls in (kind.recipe, *((ModelTable,) if folder == "configs" else ())):

@@ -9,21 +9,17 @@ from vla_eval.strict.bounds import Bounds, check_bounds
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AppearanceSettings:
-    """Changes of light, camera and colours; nothing that moves, and no number of the state, changes.
+    """Changes of light, camera and colours; nothing that moves, and no number of the state, changes."""
 
-    Attributes:
-        light: factor of all lights.
-        camera_shift_m: the base camera stands so much further to the robot's left (+y, world frame).
-        camera_turn_deg: it is turned by so much about the vertical, counterclockwise seen from above.
-        table_rgb: the table has a plain top of this red, green and blue instead of wood; None: wood.
-        hue_deg: the hue of every object of the task is so much further on the circle of hues. Red is 0,
-            green 120, blue 240.
-    """
-
-    light: Annotated[float, Bounds(0.0, 10.0)] = 1.0
+    light: Annotated[float, Bounds(0.0, 10.0)] = 1.0  # factor of all lights
+    # the base camera stands so much further to the robot's left (+y, world frame)
     camera_shift_m: Annotated[float, Bounds(-0.5, 0.5)] = 0.0
+    # it is turned by so much about the vertical, counterclockwise seen from above
     camera_turn_deg: Annotated[float, Bounds(-45.0, 45.0)] = 0.0
+    # the table has a plain top of this red, green and blue instead of wood; None: wood
     table_rgb: Annotated[tuple[float, ...] | None, Bounds(0.0, 1.0)] = None
+    # the hue of every object of the task is so much further on the circle of hues. Red is 0, green 120,
+    # blue 240.
     hue_deg: Annotated[float, Bounds(-180.0, 180.0)] = 0.0
 
     def __post_init__(self) -> None:

@@ -12,18 +12,13 @@ Which = Outcomes | int
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CaptureConfig:
-    """What to capture of an evaluation; moves no result.
+    """What to capture of an evaluation; moves no result."""
 
-    Attributes:
-        video: which episodes get an mp4: by outcome, or the first N seeds of run 0 of each task, policy and
-            n_action_steps.
-        rrd: which episodes get a file for the rerun viewer, likewise.
-        frame_stride: control steps from one frame to the next.
-    """
-
+    # which episodes get an mp4: by outcome, or the first N seeds of run 0 of each task, policy and
+    # n_action_steps
     video: Which = "none"
-    rrd: Which = "none"
-    frame_stride: Steps = 2
+    rrd: Which = "none"  # which episodes get a file for the rerun viewer, likewise
+    frame_stride: Steps = 2  # control steps from one frame to the next
 
     def __post_init__(self) -> None:
         """Check the ranges."""

@@ -27,16 +27,11 @@ Folder = Literal["configs", "policies", "prompts", "datasets", "protocols"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recipe[T]:
-    """A recipe and where it came from.
+    """A recipe and where it came from."""
 
-    Attributes:
-        name: the file's name without `.yaml`.
-        sha256: digest of the file's bytes.
-    """
-
-    name: str
+    name: str  # the file's name without `.yaml`
     path: Path
-    sha256: str
+    sha256: str  # digest of the file's bytes
     value: T
 
 

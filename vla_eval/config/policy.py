@@ -21,24 +21,18 @@ ABLATIONS = "ablations"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicyRecipe:
-    """`policies/*.yaml`: which code and which weights, under one name.
+    """`policies/*.yaml`: which code and which weights, under one name."""
 
-    Attributes:
-        version: raised when a change of the recipe moves a success rate.
-        adapter: a name from the registry (`mikasa-vla list policies`) or `module:attr`.
-        default_n_action_steps: actions executed per inference, where the evaluation names none.
-        max_workers: how many workers `workers: auto` may start, since each loads the policy.
-        needs_candidates: the policy makes no sense for a task without candidates; such a pair is left out.
-        finetune: how weights for it are trained; None for policies that have nothing to train.
-    """
-
-    version: int
+    version: int  # raised when a change of the recipe moves a success rate
     description: str
-    adapter: str
+    adapter: str  # a name from the registry (`mikasa-vla list policies`) or `module:attr`
     args: dict[str, Any] = field(default_factory=dict)  # Any: whatever the adapter takes
-    default_n_action_steps: Steps = 1
+    default_n_action_steps: Steps = 1  # actions executed per inference, where the evaluation names none
+    # how many workers `workers: auto` may start, since each loads the policy
     max_workers: Annotated[int, Bounds(1, MAX_PROCESSES)] | None = None
+    # the policy makes no sense for a task without candidates; such a pair is left out
     needs_candidates: bool = False
+    # how weights for it are trained; None for policies that have nothing to train
     finetune: FinetuneRecipe | None = None
 
     def __post_init__(self) -> None:

@@ -22,32 +22,26 @@ FREE_SETTINGS = ("stop_at_success", "eager_rendering", "render.backend")
 class Protocol:
     """`protocols/*.yaml`. `docs/protocols.md` has the table of all fields.
 
-    Attributes:
-        version: raised whenever a figure under the protocol would change.
-        source: where it is published.
-        tasks: task id -> version of the task's rules here.
-        episodes, seed_start: the seeds of each task and run.
-        runs: independent training runs; None: one or more.
-        n_action_steps: the values of K that it allows; None: any, and each K is a row.
-        metric: what is counted of an episode.
-        groups: name -> tasks: each has a summary figure of its own; none: one figure over all tasks.
-        free: settings of an evaluation that a policy may choose; all others have their defaults.
-
     Raises:
         RecipeError: a value out of its range, or a group with a task that the protocol has not.
     """
 
     name: str
+    # raised whenever a figure under the protocol would change
     version: Annotated[int, Bounds(1, MAX_EPISODES)]
     description: str
-    source: str
-    tasks: dict[str, int]
+    source: str  # where it is published
+    tasks: dict[str, int]  # task id -> version of the task's rules here
+    # `episodes`, `seed_start`: the seeds of each task and run
     episodes: Episodes
     seed_start: int
-    runs: Episodes | None = None
+    runs: Episodes | None = None  # independent training runs; None: one or more
+    # the values of K that it allows; None: any, and each K is a row
     n_action_steps: Annotated[tuple[int, ...] | None, Bounds(1, MAX_STEPS)] = None
-    metric: Literal["success_once"] = "success_once"
+    metric: Literal["success_once"] = "success_once"  # what is counted of an episode
+    # name -> tasks: each has a summary figure of its own; none: one figure over all tasks
     groups: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    # settings of an evaluation that a policy may choose; all others have their defaults
     free: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -30,27 +30,18 @@ class AssumedRates:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EvaluationEffort:
-    """What is left of an evaluation; steps, inferences and frames at most, as if no episode ended early.
-
-    Attributes:
-        n_finished: episodes that have a result.
-        n_learned_inferences: of policies that load weights.
-        n_frames: images of two cameras that are rendered for policies and captures; see `n_rendered`.
-        copies: learned policies -> bytes of their weights; each worker loads its own copy.
-        warnings: what a person should know before the first episode.
-        notes: what could not be compared.
-    """
+    """What is left of an evaluation; steps, inferences and frames at most, as if no episode ended early."""
 
     n_episodes: int
-    n_finished: int
+    n_finished: int  # episodes that have a result
     n_steps: int
     n_inferences: int
-    n_learned_inferences: int
-    n_frames: int
+    n_learned_inferences: int  # of policies that load weights
+    n_frames: int  # images of two cameras that are rendered for policies and captures; see `n_rendered`
     n_workers: int
-    copies: dict[str, int]
-    warnings: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
+    copies: dict[str, int]  # learned policies -> bytes of their weights; each worker loads its own copy
+    warnings: tuple[str, ...] = ()  # what a person should know before the first episode
+    notes: tuple[str, ...] = ()  # what could not be compared
 
     def seconds(self, rates: AssumedRates) -> float:
         """Return how long it takes at these rates, all workers busy to the end."""

@@ -26,26 +26,21 @@ class SetupKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeGroup:
-    """Episodes that differ only in run and seed.
-
-    Attributes:
-        adapter: registry name of the policy's code.
-        args: the adapter's keyword arguments.
-        env: the environment, before it is known which cameras the policy needs.
-        n_rows: how many episodes a forward pass of the policy has room for: the slots of a worker where the
-            policy is in it, else what its server says.
-        checkpoint: of a policy of several checkpoints, which one; it has the run of that number alone.
-        part: the policy's name in recipes and among shared policies; with several checkpoints, that of one.
-    """
+    """Episodes that differ only in run and seed."""
 
     key: GroupKey
-    adapter: str
+    adapter: str  # registry name of the policy's code
+    # the adapter's keyword arguments
     args: Mapping[str, Any]  # Any: whatever the adapter takes
-    env: EnvSettings
+    env: EnvSettings  # the environment, before it is known which cameras the policy needs
     rollout: RolloutSettings
     instruction: str
+    # how many episodes a forward pass of the policy has room for: the slots of a worker where the policy
+    # is in it, else what its server says
     n_rows: int = 1
+    # of a policy of several checkpoints, which one; it has the run of that number alone
     checkpoint: int | None = None
+    # the policy's name in recipes and among shared policies; with several checkpoints, that of one
     part: str = ""
 
     @property

@@ -45,17 +45,11 @@ SUSTAINED_TFLOPS = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepCost:
-    """What determines the operations of a training step.
+    """What determines the operations of a training step."""
 
-    Attributes:
-        parameters: weights that each sample goes through.
-        tokens: of a sample.
-        trained: which of the weights are.
-    """
-
-    parameters: float
-    tokens: int
-    trained: Trained
+    parameters: float  # weights that each sample goes through
+    tokens: int  # of a sample
+    trained: Trained  # which of the weights are
 
     def __post_init__(self) -> None:
         for name in ("parameters", "tokens"):
@@ -65,23 +59,19 @@ class StepCost:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TableRow:
-    """One row: a policy at one or more numbers of action steps.
-
-    Attributes:
-        policy: recipe in `policies/` with a `finetune` section, whose chunk has at least `n_action_steps`.
-        n_action_steps: actions executed per inference; each checkpoint is evaluated at all of them.
-        tasks: those of the table's tasks that the row is for; None: all.
-        finetune: fields of the recipe's `finetune` section that are set to other values in this row.
-        slots_per_worker: episodes that a worker evaluates side by side, one forward pass for all of them.
-        cost: what a training step costs, for the estimate of GPU hours; None where it is small.
-    """
+    """One row: a policy at one or more numbers of action steps."""
 
     name: str
+    # recipe in `policies/` with a `finetune` section, whose chunk has at least `n_action_steps`
     policy: str
+    # actions executed per inference; each checkpoint is evaluated at all of them
     n_action_steps: tuple[int, ...]
-    tasks: tuple[str, ...] | None = None
+    tasks: tuple[str, ...] | None = None  # those of the table's tasks that the row is for; None: all
+    # fields of the recipe's `finetune` section that are set to other values in this row
     finetune: dict[str, Any] | None = None  # Any: decoded with the row's recipe
+    # episodes that a worker evaluates side by side, one forward pass for all of them
     slots_per_worker: int = 1
+    # what a training step costs, for the estimate of GPU hours; None where it is small
     cost: StepCost | None = None
 
     def __post_init__(self) -> None:
@@ -97,38 +87,32 @@ class TableRow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelTable:
-    """`configs/*.yaml` with `rows`: a table of learned policies. `docs/paper_table.md` explains it.
-
-    Attributes:
-        tasks: task ids; each row is fine-tuned for each of them, but for rows that name their own.
-        datasets: folder with one dataset per task, named like the task.
-        steps: gradient steps of each fine-tuning; None: as many as each row's recipe says.
-        run_seeds: one fine-tuning each; the SEM is over them.
-        controls: scripted policies next to the rows of a task, at each of their numbers of action steps.
-        protocol: the published protocol whose summary figure is printed below the table; None: none.
-        env: arguments of all tasks, such as the control mode of the datasets.
-        finetune: fields of the recipes' `finetune` sections that are set to other values in all rows.
-        episodes, seed_start, simulator, render, stop_at_success: see `EvalConfig`.
-        allow_unreplayed: see `FinetuneConfig`.
-    """
+    """`configs/*.yaml` with `rows`: a table of learned policies. `docs/paper_table.md` explains it."""
 
     name: str
+    # task ids; each row is fine-tuned for each of them, but for rows that name their own
     tasks: tuple[str, ...]
-    datasets: str
+    datasets: str  # folder with one dataset per task, named like the task
     rows: tuple[TableRow, ...]
+    # gradient steps of each fine-tuning; None: as many as each row's recipe says
     steps: int | None = None
     description: str = ""
-    run_seeds: tuple[int, ...] = (0,)
+    run_seeds: tuple[int, ...] = (0,)  # one fine-tuning each; the SEM is over them
+    # `episodes`, `seed_start`, `simulator`, `render`, `stop_at_success`: see `EvalConfig`
     episodes: int = 100
     seed_start: int = 1
+    # scripted policies next to the rows of a task, at each of their numbers of action steps
     controls: tuple[str, ...] = ("random", "cue_blind", "oracle")
+    # the published protocol whose summary figure is printed below the table; None: none
     protocol: str | None = None
     simulator: Simulator = "maniskill"
+    # arguments of all tasks, such as the control mode of the datasets
     env: dict[str, Any] = field(default_factory=dict)  # Any: the tasks check their arguments
     render: RenderSettings = field(default_factory=RenderSettings)
     stop_at_success: bool = False
+    # fields of the recipes' `finetune` sections that are set to other values in all rows
     finetune: dict[str, Any] | None = None  # Any: decoded with each row's recipe
-    allow_unreplayed: bool = False
+    allow_unreplayed: bool = False  # see `FinetuneConfig`
 
     def __post_init__(self) -> None:
         check_run_name(self.name)

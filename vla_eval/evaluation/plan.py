@@ -41,41 +41,34 @@ from vla_eval.wire.metadata import ServerMetadata
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """The episodes of a run, and facts about them.
+    """The episodes of a run, and facts about them."""
 
-    Attributes:
-        jobs: every episode, in a fixed order.
-        recipe_hashes: `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned
-            policies, and the datasets that these were trained on (another dataset of the same name is
-            `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on,
-            those for one task `policies/NAME/TASK/run-0`.
-        normalization: learned policy -> by which statistics it normalises, see `normalization_notes`.
-        servers: policy behind a socket -> its server's metadata.
-        sentences: policy with weights, one of several checkpoints as in `recipe_hashes` -> those it was
-            trained with, see `Sentences`; None where that is not known.
-        training_seeds: policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose
-            demonstrations it was trained on, where known.
-        policy_names: what records call the policies, in the order of the configuration.
-        shared: `EpisodeGroup.part` whose inference all workers share -> what the configuration calls it.
-        left_out: (task, policy) pairs that make no sense together, and why, for a message.
-        max_workers: the most workers that `workers: auto` may start, since each loads the policies that are
-            not shared; None: no limit.
-        ignored: what checkpoints ask for that is not done here, see `ignored_fields`.
-        shard: the part of the configuration's episodes that `jobs` are; None: all of them.
-    """
-
-    jobs: tuple[EpisodeJob, ...]
+    jobs: tuple[EpisodeJob, ...]  # every episode, in a fixed order
+    # `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned policies, and
+    # the datasets that these were trained on (another dataset of the same name is `datasets/NAME of
+    # POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on, those for one task
+    # `policies/NAME/TASK/run-0`.
     recipe_hashes: Mapping[str, str]
+    # learned policy -> by which statistics it normalises, see `normalization_notes`
     normalization: Mapping[str, Mapping[str, Any]]  # Any: plain data
+    # policy behind a socket -> its server's metadata
     servers: Mapping[str, Mapping[str, Any]]  # Any: plain data
+    # policy with weights, one of several checkpoints as in `recipe_hashes` -> those it was trained with,
+    # see `Sentences`; None where that is not known
     sentences: Mapping[str, Sentences | None]
+    # policy, one of several checkpoints as in `recipe_hashes` -> task -> the seeds whose demonstrations
+    # it was trained on, where known
     training_seeds: Mapping[str, Mapping[str, tuple[SeedRange, ...]]]
     task_versions: Mapping[str, int]
-    policy_names: tuple[str, ...]
+    policy_names: tuple[str, ...]  # what records call the policies, in the order of the configuration
+    # `EpisodeGroup.part` whose inference all workers share -> what the configuration calls it
     shared: Mapping[str, str]
-    left_out: tuple[str, ...]
+    left_out: tuple[str, ...]  # (task, policy) pairs that make no sense together, and why, for a message
+    # the most workers that `workers: auto` may start, since each loads the policies that are not shared;
+    # None: no limit
     max_workers: int | None
-    ignored: tuple[str, ...] = ()
+    ignored: tuple[str, ...] = ()  # what checkpoints ask for that is not done here, see `ignored_fields`
+    # the part of the configuration's episodes that `jobs` are; None: all of them
     shard: Shard | None = None
 
     @property

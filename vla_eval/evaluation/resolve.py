@@ -26,20 +26,14 @@ INFERENCE_FIELDS = ("inference", "inference_max_batch")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ResolvedEvaluation:
-    """An evaluation as it will run.
+    """An evaluation as it will run."""
 
-    Attributes:
-        config: what was asked for; `inference` is never `auto`.
-        policies: those of the configuration, each read once; a policy server asked once.
-        shard: the part of the episodes that is run; None: all.
-        named_out: the run folder that was asked for; None: the default one.
-    """
-
-    config: EvalConfig
+    config: EvalConfig  # what was asked for; `inference` is never `auto`
+    # those of the configuration, each read once; a policy server asked once
     policies: tuple[PolicyEntry, ...]
     backend: Backend
-    shard: Shard | None
-    named_out: Path | None
+    shard: Shard | None  # the part of the episodes that is run; None: all
+    named_out: Path | None  # the run folder that was asked for; None: the default one
 
     @classmethod
     def of(

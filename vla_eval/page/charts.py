@@ -47,20 +47,13 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Series:
-    """Points that belong together.
-
-    Attributes:
-        color: number of the color and of the marker.
-        points: in order of x.
-        kind: `chance` and `ceiling` are lines of reference, without markers.
-        is_step: y is constant until the next x.
-    """
+    """Points that belong together."""
 
     name: str
-    color: int
-    points: tuple[Point, ...]
-    kind: LineKind = "solid"
-    is_step: bool = False
+    color: int  # number of the color and of the marker
+    points: tuple[Point, ...]  # in order of x
+    kind: LineKind = "solid"  # `chance` and `ceiling` are lines of reference, without markers
+    is_step: bool = False  # y is constant until the next x
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,21 +128,14 @@ def _forest(bars: Sequence[Bar], width_px: float, label_px: float) -> Figure:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Curves:
-    """Rates in [0, 1] over a number, one line per series.
+    """Rates in [0, 1] over a number, one line per series."""
 
-    Attributes:
-        series: at least one point in all.
-        x_title: what x is, with its unit.
-        x_ticks: in increasing order; the first and the last are the ends of the axis.
-        x_labels: what is written at each tick, if not its number.
-    """
-
-    series: Sequence[Series]
+    series: Sequence[Series]  # at least one point in all
     title: str
     description: str
-    x_title: str
-    x_ticks: Sequence[float]
-    x_labels: Sequence[str] | None = None
+    x_title: str  # what x is, with its unit
+    x_ticks: Sequence[float]  # in increasing order; the first and the last are the ends of the axis
+    x_labels: Sequence[str] | None = None  # what is written at each tick, if not its number
 
 
 def curves(drawn: Curves) -> Chart:

@@ -162,22 +162,15 @@ class Listing(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reproduction:
-    """What is needed to reproduce a run.
-
-    Attributes:
-        commands: from the checkout to the last session; empty if none was recorded.
-        lock: versions of packages, and digests of all that the results depend on.
-        warning: why the commands may not be enough; may be empty.
-        environment_changes: how the machine or the versions changed between sessions.
-    """
+    """What is needed to reproduce a run."""
 
     title: str
-    commands: str
-    lock: str
-    warning: str
+    commands: str  # from the checkout to the last session; empty if none was recorded
+    lock: str  # versions of packages, and digests of all that the results depend on
+    warning: str  # why the commands may not be enough; may be empty
     listings: tuple[Listing, ...]
     config: str
-    environment_changes: str
+    environment_changes: str  # how the machine or the versions changed between sessions
 
 
 def reproduction(run: StoredRun) -> Reproduction:

@@ -12,18 +12,12 @@ from vla_eval.storage.timings import read_timings
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Material:
-    """The data of a page.
-
-    Attributes:
-        table: as `mikasa-vla report` prints it.
-        timings: run folder -> episode -> seconds.
-        colors: policy -> number of its colour and marker, the same in every plot.
-    """
+    """The data of a page."""
 
     runs: tuple[StoredRun, ...]
-    table: Table
-    timings: Mapping[str, Mapping[EpisodeKey, EpisodeTiming]]
-    colors: Mapping[str, int]
+    table: Table  # as `mikasa-vla report` prints it
+    timings: Mapping[str, Mapping[EpisodeKey, EpisodeTiming]]  # run folder -> episode -> seconds
+    colors: Mapping[str, int]  # policy -> number of its colour and marker, the same in every plot
 
     @property
     def tasks(self) -> list[str]:

@@ -34,12 +34,7 @@ class FilmPair:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbeSection:
-    """A probe, or a grid.
-
-    Attributes:
-        matrices: pairs by first choice in the world as drawn (rows) and in the other one (columns); a cell is
-            right if some of its pairs follow both cues.
-    """
+    """A probe, or a grid."""
 
     title: str
     table: PrintedTable
@@ -48,5 +43,7 @@ class ProbeSection:
     plots: Plots | None = None
     curves_table: PrintedTable | None = None
     heat: tuple[tuple[str, tuple[Chart, ...]], ...] = ()
+    # pairs by first choice in the world as drawn (rows) and in the other one (columns); a cell is right
+    # if some of its pairs follow both cues
     matrices: tuple[Matrix, ...] = ()
     films: tuple[FilmPair, ...] = ()

@@ -12,17 +12,13 @@ CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
-    """What was counted since the start.
-
-    Attributes:
-        n_errors: inferences or beginnings of episodes at which the policy failed.
-        queue_seconds: added up over all inferences: between the request and the beginning of its pass.
-    """
+    """What was counted since the start."""
 
     n_inferences: int = 0
     n_passes: int = 0
-    n_errors: int = 0
+    n_errors: int = 0  # inferences or beginnings of episodes at which the policy failed
     infer_seconds: float = 0.0
+    # added up over all inferences: between the request and the beginning of its pass
     queue_seconds: float = 0.0
 
 

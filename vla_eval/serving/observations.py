@@ -30,16 +30,12 @@ class RequestError(VlaEvalError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObservationReader:
-    """Reads the observations that a policy needs.
+    """Reads the observations that a policy needs."""
 
-    Attributes:
-        cameras: camera of the policy -> key and size of its image.
-        states: the policy's states -> names of their numbers, in the order in which a request holds them.
-        end_effector: whether a state may also be the 10 numbers of the kind `eef`, which the policy reads.
-    """
-
-    cameras: Mapping[str, CameraImage]
+    cameras: Mapping[str, CameraImage]  # camera of the policy -> key and size of its image
+    # the policy's states -> names of their numbers, in the order in which a request holds them
     states: Mapping[str, tuple[str, ...]]
+    # whether a state may also be the 10 numbers of the kind `eef`, which the policy reads
     end_effector: bool
 
     @property

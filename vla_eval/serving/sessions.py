@@ -32,32 +32,20 @@ logger = logging.getLogger(__name__)
 
 @dataclass(slots=True, kw_only=True)
 class Session:
-    """One client's episode.
-
-    Attributes:
-        address: of the machine that the connection comes from.
-        name: its id within the connection; None: the connection itself.
-        slot: where the policy keeps what it remembers of it.
-        row: its row of a pass.
-        used_at: time of its last message, by the clock of the table.
-        episode: what was begun last; None before.
-        was_reset: whether it was begun by a `reset`.
-        frames: frames that the policy has not been given yet.
-        step: the step of the newest frame; None before the first.
-        n_pending: requests that have no reply yet.
-    """
+    """One client's episode."""
 
     connection: int
-    address: str
-    name: str | None
-    slot: int
-    row: int
-    used_at: float
-    episode: EpisodeStart | None = None
-    was_reset: bool = False
+    address: str  # of the machine that the connection comes from
+    name: str | None  # its id within the connection; None: the connection itself
+    slot: int  # where the policy keeps what it remembers of it
+    row: int  # its row of a pass
+    used_at: float  # time of its last message, by the clock of the table
+    episode: EpisodeStart | None = None  # what was begun last; None before
+    was_reset: bool = False  # whether it was begun by a `reset`
+    # frames that the policy has not been given yet
     frames: list[Observation] = field(default_factory=list)
-    step: int | None = None
-    n_pending: int = 0
+    step: int | None = None  # the step of the newest frame; None before the first
+    n_pending: int = 0  # requests that have no reply yet
 
 
 class SessionTable:

@@ -30,12 +30,7 @@ class _Kind(NamedTuple):
 
 
 def folder_lines(folder: Path) -> Lines:
-    """Yield label and text of each line that describes a folder.
-
-    Raises:
-        RunFolderError: it is none of these kinds.
-        VlaEvalError: its files cannot be read.
-    """
+    """Yield label and text of each line that describes a folder."""
     for kind in KINDS:
         if kind.is_it(folder):
             yield kind.word, str(folder)
