@@ -49,6 +49,7 @@ class EpisodeConfig(PortedConfig):
     takes_bytes: ClassVar[bool] = True
     # actions beyond an episode's end count nothing, see `episode_samples`
     masks_padding: ClassVar[bool] = True
+    inference_delta_indices: ClassVar[None] = None  # the frame itself: the policy keeps its own history
 
     # frames of history in a training sample; at least the longest episode, so that no memory begins in
     # its middle. None: our `finetune` takes the dataset's longest.
@@ -148,11 +149,6 @@ class EpisodeConfig(PortedConfig):
     def observation_delta_indices(self) -> list[int]:
         """The window up to the frame, and a frame beyond every episode's end: lerobot takes its last one."""
         return [*range(1 - self.n_window_steps, 1), self.n_window_steps]
-
-    @property
-    def inference_delta_indices(self) -> None:
-        """Only the frame itself: the policy keeps its own history."""
-        return None
 
     @property
     def action_delta_indices(self) -> list[int]:

@@ -52,6 +52,9 @@ class MikasaOfflineRLConfig(PortedConfig):
 
     masks_padding: ClassVar[bool] = True  # there is none: one action per sample
     reads_state: ClassVar[bool] = False  # the encoder of the paper's baselines has none
+    observation_delta_indices: ClassVar[list[int]] = [0, 1]  # the frame and the next one
+    inference_delta_indices: ClassVar[None] = None  # the frame itself
+    action_delta_indices: ClassVar[list[int]] = [0]
 
     chunk_size: int = 1
     n_action_steps: int = 1
@@ -102,21 +105,6 @@ class MikasaOfflineRLConfig(PortedConfig):
         if not self.image_features or self.action_feature is None:
             raise ValueError(f"'{TYPE}' needs images and action")
         self.check_one_size()
-
-    @property
-    def observation_delta_indices(self) -> list[int]:
-        """The frame and the next one."""
-        return [0, 1]
-
-    @property
-    def inference_delta_indices(self) -> None:
-        """Only the frame itself."""
-        return None
-
-    @property
-    def action_delta_indices(self) -> list[int]:
-        """One action."""
-        return [0]
 
 
 def network_stages(config: Any) -> Stages:

@@ -5,7 +5,7 @@ Neither class is registered with lerobot: only a policy's own configuration has 
 
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Any  # lerobot is untyped
+from typing import Any, ClassVar  # lerobot is untyped
 
 from lerobot.configs import NormalizationMode, PreTrainedConfig
 from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
@@ -79,6 +79,8 @@ class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untype
 class PromptedConfig(PortedConfig):
     """A policy whose language model reads images and a prompt: one frame in, one chunk out."""
 
+    observation_delta_indices: ClassVar[None] = None  # the frame itself
+
     # fields of the images that are read, in this order
     pictures: list[str] = field(default_factory=list)
     # sizes that differ from the published model's, see the policy's `NetworkSizes`
@@ -123,11 +125,6 @@ class PromptedConfig(PortedConfig):
     def encoder_settings(self) -> dict[str, Any]:
         """What our normalising steps are made from, statistics aside; a base's own are replaced by it."""
         return {"fields": self.normalizations(), "gripper": self.gripper_spec()}
-
-    @property
-    def observation_delta_indices(self) -> None:
-        """The frame itself."""
-        return None
 
     @property
     def action_delta_indices(self) -> list[int]:

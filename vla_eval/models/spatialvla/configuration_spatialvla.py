@@ -141,11 +141,7 @@ class MikasaSpatialVLAConfig(PromptedConfig):
             )
 
     not_of_base = ("inference_attention",)  # a fine-tuning does not take it over
-
-    @property
-    def reads_state(self) -> bool:
-        """Whether the policy has any use for `observation.state`: it has none."""
-        return False
+    reads_state = False
 
     def network_sizes(self) -> NetworkSizes:
         """Return the sizes of the network."""

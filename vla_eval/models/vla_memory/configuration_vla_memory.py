@@ -30,6 +30,7 @@ class VlaMemoryConfig:
     """Memory of a VLA that reads one frame: earlier frames as further images, and recurrent tokens."""
 
     masks_padding: ClassVar[bool]
+    observation_delta_indices: ClassVar[None] = None  # the frame itself: earlier ones come as fields
 
     memory_places: int = 0  # further images of each camera at most; 0: none
     memory_rule: str = "last"  # which frames they are, a name of `frame_choice.RULES`
@@ -109,11 +110,6 @@ class VlaMemoryConfig:
         images = [feature for key, feature in config.image_features.items() if key not in self.memory_fields]
         for key in self.memory_fields:
             config.input_features[key] = PolicyFeature(type=FeatureType.VISUAL, shape=images[0].shape)
-
-    @property
-    def observation_delta_indices(self) -> None:
-        """The frame itself: earlier ones come as fields."""
-        return None
 
 
 def _n_segments(window_steps: int, stride: int) -> int:
