@@ -69,10 +69,7 @@ def register_steps(cls: type) -> None:
 def tokenizer_overrides(
     folder: Path, config: Any, steps: Sequence[str], *, tokenizer: str | None
 ) -> dict[str, dict[str, Any]]:
-    """Return what the steps of a saved preprocessor that make tokens need as settings, by their names.
-
-    `tokenizer`: see `load_processors`.
-    """
+    """Return the settings of a preprocessor's steps that make tokens; `tokenizer`: see `load_processors`."""
     overrides: dict[str, dict[str, Any]] = {}
     own = _tokenizer(folder, tokenizer)
     if TOKENIZER_STEP in steps and own is not None:

@@ -92,10 +92,7 @@ def describe(folder: Path, merged: "MergedRun") -> str:
 
 
 def _by_name(runs: Sequence[Path]) -> dict[str, list[Path]]:
-    """Return the run folders that belong together: of an audit or a probe, those of the same name.
-
-    A run folder itself has the name ".".
-    """
+    """Return the run folders that belong together, by name; that of a run folder itself is "."."""
     found: dict[str, list[Path]] = {}
     for path in runs:
         inside = sorted(file.parent.name for file in path.glob(f"*/{RUN_FILE}"))

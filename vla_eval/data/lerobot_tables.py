@@ -71,10 +71,7 @@ def read_episodes(root: Path) -> Dataset:
 
 
 def read_tasks(root: Path) -> pd.DataFrame:
-    """Return the sentences in the order of `task_index`, by which lerobot looks them up.
-
-    lerobot's `load_tasks` keeps the order of the file.
-    """
+    """Return the sentences in the order of `task_index`; lerobot's `load_tasks` keeps that of the file."""
     path = root / TASKS_FILE
     table = read_table(path)
     column = next((name for name in SENTENCE_COLUMNS if name in table.column_names), SENTENCE_COLUMNS[0])

@@ -120,10 +120,7 @@ def _cells(runs: Sequence[_Run]) -> list[GridCell]:
 
 
 def _reads_every(records: Sequence[EpisodeRecord]) -> bool | None:
-    """Return whether a policy is given every frame; None while no record shows it.
-
-    With one inference per frame both are the same.
-    """
+    """Return whether a policy is given every frame; None if no record shows it."""
     known = [
         (record.n_frames, record.n_inferences)
         for record in records

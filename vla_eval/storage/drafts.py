@@ -18,10 +18,7 @@ NO_LINKS = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, err
 
 @contextlib.contextmanager
 def whole_folder(out: Path, *, error: type[VlaEvalError]) -> Iterator[Path]:
-    """Give a place to write to; it becomes `out` at the end, or is removed after an exception.
-
-    An `out` that exists is an error of this class.
-    """
+    """Give a place to write to that becomes `out`, or is removed after an exception; `error` if it exists."""
     if out.exists():
         raise error(f"{out}: exists already. Name a new folder with --out, or remove this one.")
     let_write(out)

@@ -72,10 +72,7 @@ class _Appearance:
 
 
 def _plain_top(rgb: tuple[float, ...]) -> sapien.Entity:
-    """Return a sheet that is only rendered.
-
-    The table's own material is shared by all scenes of the process, so that it must not be changed.
-    """
+    """Return a sheet that is only rendered: all scenes of the process share the table's own material."""
     material = sapien.render.RenderMaterial(base_color=[*rgb, 1.0])
     body = sapien.render.RenderBodyComponent()
     body.attach(sapien.render.RenderShapeBox([*TABLE_HALF_SIZE_M, TOP_M / 2], material))

@@ -41,10 +41,7 @@ class Processors(NamedTuple):
 
 
 def make_model(job: TrainingJob, meta: Any) -> Any:
-    """Return the policy with its weights on its device, wrapped by peft where LoRA is trained.
-
-    The job's policy notes where its weights came from.
-    """
+    """Return the policy, which notes its weights, on its device, wrapped by peft where LoRA is trained."""
     config = job.policy
     with _plain_errors(job, "cannot be built"):
         try:
@@ -138,10 +135,7 @@ def _overrides(job: TrainingJob, config: Any, folder: Path, stats: Any) -> dict[
 def _address_ours(
     overrides: dict[str, Any], steps: tuple[str, ...], lerobots: str, ours: str, config: Any
 ) -> None:
-    """Give our own normaliser the statistics that were meant for lerobot's.
-
-    With them, the settings of this training and not those of its base.
-    """
+    """Give our own normaliser the statistics meant for lerobot's, and the settings of this training."""
     if ours not in steps:
         return
     given = overrides.pop(lerobots)

@@ -40,10 +40,7 @@ class _Worker[J: Job]:
 
 
 class WorkerPool[J: Job, A]:
-    """Some worker processes; a context manager that leaves none behind.
-
-    Logs and messages call the first worker `first_index`.
-    """
+    """Some worker processes, numbered from `first_index`; a context manager that leaves none behind."""
 
     def __init__(self, spec: WorkerSpec, *, size: int, first_index: int = 0) -> None:
         self._spec, self._size, self._first_index = spec, size, first_index

@@ -1,7 +1,4 @@
-"""What lerobot's configurations of our own policies from scratch share.
-
-A training sample is an episode. Knows no network.
-"""
+"""What configurations of our policies that train on episodes share. Knows no network."""
 
 import math
 from collections.abc import Mapping

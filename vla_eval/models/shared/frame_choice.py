@@ -88,10 +88,7 @@ class Rule(NamedTuple):
 
 
 def blocks_of(image: ImageArray) -> Blocks:
-    """Return the mean colours of the blocks of an image (3, H, W) of at least 32 pixels each way.
-
-    Exact, whatever the array's order in memory.
-    """
+    """Return the mean colours of the blocks of an image (3, H, W) of 32 pixels or more each way, exactly."""
     return tuple(_means(image.astype(np.int64), n) for n in BLOCKS)
 
 

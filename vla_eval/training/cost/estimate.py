@@ -63,10 +63,7 @@ class Estimate:
 def estimate(
     model: Any, policy: Any, recipe: FinetuneRecipe, *, device: str, tflops: float | None = None
 ) -> Estimate:
-    """Estimate what a fine-tuning of a model takes; its weights need no memory.
-
-    `tflops`: rate to assume; None: a usual one of the device.
-    """
+    """Estimate what a fine-tuning takes, at a rate of the device or a usual one; weights need no memory."""
     usual = CPU_TFLOPS if device == "cpu" else SUSTAINED_TFLOPS
     return Estimate(
         model=describe_model(model),

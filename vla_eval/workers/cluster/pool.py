@@ -56,10 +56,7 @@ class _Worker[J: Job]:
 
 
 class ClusterPool[J: Job, A]:
-    """Some actors with a worker process each; a context manager that leaves none behind.
-
-    With `takes_gpu` a GPU is reserved for each.
-    """
+    """Some actors with a worker process, and a GPU (`takes_gpu`), each; a context manager that ends all."""
 
     def __init__(
         self,
