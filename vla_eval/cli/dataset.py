@@ -160,8 +160,7 @@ def _asked_for(args: argparse.Namespace) -> list[str]:
 
 def _convert_control_mode(args: argparse.Namespace) -> int:
     from vla_eval.cli.record import describe
-    from vla_eval.cli.terminal.progress import stop_on_signals
-    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
     from vla_eval.control_modes import action_spec
     from vla_eval.errors import RecipeError
 

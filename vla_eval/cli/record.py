@@ -68,8 +68,7 @@ def run(args: argparse.Namespace) -> int:
     """Record and replay; the datasets' names go to standard output, everything else to standard error."""
     # Here and not above: `mikasa-vla --help` need not wait for lerobot.
     from vla_eval.cli.shared.output import hint_merge, hint_next
-    from vla_eval.cli.terminal.progress import stop_on_signals
-    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
     from vla_eval.data.recording.record import record
 
     recipe = _recipe(args)
@@ -119,7 +118,7 @@ def _replay_new(
     backend: Backend,
 ) -> int:
     """Replay the datasets that no replay has passed yet; return the exit code."""
-    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.cli.terminal.progress import RecordingProgress
     from vla_eval.data.manifest import needs_replay
 
     paths = [one.path for one in summary.datasets if not args.no_replay and needs_replay(one.path)]

@@ -47,8 +47,7 @@ def run(args: argparse.Namespace) -> int:
     if args.rebuild is not None:
         return _rebuild(args)
     # Here and not above: `mikasa-vla --help` need not wait for progress bars.
-    from vla_eval.cli.terminal.progress import stop_on_signals
-    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
     from vla_eval.data.replaying.replay import find_datasets
 
     needs = (shared_folder(args.dataset),)
@@ -66,8 +65,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _rebuild(args: argparse.Namespace) -> int:
     from vla_eval.cli.record import describe as describe_dataset
-    from vla_eval.cli.terminal.progress import stop_on_signals
-    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
     from vla_eval.data.derived.rebuild import rebuild
 
     if args.episodes is not None or args.pixels:

@@ -9,8 +9,7 @@ from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
 
 if TYPE_CHECKING:
-    from vla_eval.cli.terminal.progress import StopRequest
-    from vla_eval.cli.terminal.recording_progress import RecordingProgress
+    from vla_eval.cli.terminal.progress import RecordingProgress, StopRequest
     from vla_eval.data.manifest import ReplayReport
 
 EXIT_MISMATCH = 1

@@ -2,22 +2,28 @@
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+from tqdm import tqdm
 
 from vla_eval.cli.terminal.episode_bar import EpisodeBar
-from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines
+from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines, PhaseLines
 from vla_eval.config.capture import CaptureConfig
 from vla_eval.evaluation.evaluate import EvaluationObserver, EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.records import EpisodeRecord
 from vla_eval.workers.load import Load
+
+if TYPE_CHECKING:  # of the recorder, which takes longer to import
+    from vla_eval.data.recording.record import Phase
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 STDERR = 2
@@ -195,5 +201,46 @@ class Progress(EvaluationObserver):
 
     def close(self) -> None:
         """Write how far it has come."""
+        self._bar.close()
+        self._lines.close(stopped=self._stop.is_asked)
+
+
+class RecordingProgress:
+    """A `RecordingObserver`; all but mismatches goes to standard error."""
+
+    def __init__(self, stop: StopRequest, *, json_progress: int | None = None) -> None:
+        """Take the request to stop, and where lines for other programs go."""
+        lines = JsonLines(json_progress)
+        self._stop = stop
+        self._bar = EpisodeBar(is_quiet=lines.is_stderr)
+        self._lines = PhaseLines(lines)
+
+    def say(self, sentence: str) -> None:
+        """Write a sentence to standard error."""
+        self._bar.write(sentence)
+
+    def on_phase(self, task: str, phase: "Phase", *, n_done: int, n_total: int) -> None:
+        """Begin a new bar, or a new line."""
+        self._lines.on_phase(task, phase, n_done=n_done, n_total=n_total)
+        self._bar.begin(n_done=n_done, n_total=n_total, title=f"{task}: {phase}")
+
+    def on_progress(self, *, n_done: int) -> None:
+        """Count."""
+        self._lines.on_progress(n_done=n_done)
+        self._bar.advance(n_done=n_done)
+
+    def on_mismatch(self, sentence: str) -> None:
+        """Print it: it is what the command is for."""
+        self._lines.on_mismatch(sentence)
+        tqdm.write(sentence, file=sys.stdout)
+
+    def on_tick(self) -> bool:
+        """Write a line now and then; return whether a signal has asked to stop."""
+        self._bar.tick()
+        self._lines.on_tick()
+        return self._stop.is_asked
+
+    def close(self) -> None:
+        """Write how far the phase has come."""
         self._bar.close()
         self._lines.close(stopped=self._stop.is_asked)
