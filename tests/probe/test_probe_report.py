@@ -18,7 +18,7 @@ from vla_eval.probe.find_worlds import find_probes
 from vla_eval.probe.grid import GridSettings, plan_grid
 from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.page.sections import probe_sections
-from vla_eval.probe.report_text import probe_texts
+from vla_eval.probe.probe_text import probe_texts
 from vla_eval.probe.world_records import by_policy
 from vla_eval.probe.worlds import ProbeSettings
 from vla_eval.records import EpisodeRecord

@@ -1,7 +1,11 @@
 """The table of a probe as Markdown, CSV, JSON, LaTeX or an HTML table."""
 
 import json
+from collections.abc import Sequence
 
+from vla_eval.probe.choice_pairs import ChoicePairs
+from vla_eval.probe.find_worlds import find_probes
+from vla_eval.probe.grid_text import render_grid
 from vla_eval.probe.mistakes import MISTAKES, Mistakes
 from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import Range
@@ -9,11 +13,20 @@ from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable
 from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate, success_json
+from vla_eval.results.cells import markdown_text
 from vla_eval.results.estimates import Interval
 from vla_eval.results.formats import Format
 from vla_eval.results.own_statistics import rate
-from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of, write_tables
+from vla_eval.results.printed_table import (
+    UNDEFINED,
+    Column,
+    PrintedTable,
+    cells_of,
+    markdown_table,
+    write_tables,
+)
 from vla_eval.results.relative_statistics import SMALLEST_SHOWN_P
+from vla_eval.storage.run_folder import StoredRun
 
 PROBE_VERSION = 1
 HALF_LIFE_STATES = {False: "measured", True: "beyond_longest_delay"}
@@ -154,3 +167,30 @@ _COLUMNS: tuple[Column[ProbeRow], ...] = (
     Column("p", lambda row: _shown_p(row.p_value)),
     Column("p (Holm)", lambda row: _shown_p(row.corrected_p)),
 )
+
+
+def probe_texts(runs: Sequence[StoredRun]) -> list[str]:
+    """Return Markdown for each probe and each grid among the run folders."""
+    texts = []
+    for probe in find_probes(runs):
+        if probe.worlds:
+            matrices = map(_pairs_text, probe.pairs())
+            table = render_probe(probe.table(), "markdown")
+            doubles = [f"- {markdown_text(note)}" for note in probe.doubles]
+            texts.append("\n\n".join([f"**Probe {probe.folder}**", table, *doubles, *matrices]))
+        if probe.grid:
+            grid = render_grid(probe.grid_table(), "markdown")
+            texts.append(f"**Grid {probe.folder}**\n\n{grid}")
+    return texts
+
+
+def _pairs_text(pairs: ChoicePairs) -> str:
+    title = (
+        f"First choices of {pairs.policy} on {pairs.world.task}, K = {pairs.n_action_steps}: as drawn "
+        f"(rows), {pairs.world.label} (columns)"
+    )
+    indices = range(len(pairs.names))
+    counts = [[str(pairs.counts.get((row, column), 0)) for column in indices] for row in indices]
+    rows = [[name, *own] for name, own in zip(pairs.names, counts, strict=True)]
+    table = markdown_table(("drawn ↓ other →", *pairs.names), rows, [False, *(True for _ in indices)])
+    return f"{title}\n\n{table}"
