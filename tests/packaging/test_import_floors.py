@@ -25,7 +25,7 @@ CHEAP_ROOMS = (
         "evaluation",
         "audit",
     ),
-    *("probe", "studies", "cli", "cli.shared", "cli.terminal", "cli.checkpoint"),
+    *("probe", "studies", "cli", "cli.shared", "cli.terminal"),
 )
 """What `--help`, `list`, `report` and the start of `eval` import; import-linter holds the rest."""
 ALSO_CHEAP = (
