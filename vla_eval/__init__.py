@@ -21,6 +21,7 @@ _PLACES = {
     "list_policies": "listing",
     "list_tasks": "listing",
     "load_run": "run",
+    "make_env": "environments",
 }
 """Name -> its module in `vla_eval.api`, imported when it is first asked for; types: `__init__.pyi`."""
 

@@ -1,4 +1,5 @@
 from vla_eval.api.checking import check_policy as check_policy
+from vla_eval.api.environments import make_env as make_env
 from vla_eval.api.evaluating import evaluate as evaluate
 from vla_eval.api.listing import list_policies as list_policies
 from vla_eval.api.listing import list_tasks as list_tasks

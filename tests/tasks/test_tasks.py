@@ -70,7 +70,10 @@ def test_state_observation_has_the_official_size(task: str, n_numbers: int) -> N
 
 def test_gym_make_gives_the_task_with_horizon_instruction_and_info(sampled_task: str) -> None:
     env = gymnasium.make(
-        f"vla_eval/{sampled_task}", obs_mode="state", control_mode="pd_ee_delta_pose", render_backend="none"
+        f"vla_eval_maniskill/{sampled_task}",
+        obs_mode="state",
+        control_mode="pd_ee_delta_pose",
+        render_backend="none",
     )
     _, info = env.reset(seed=1)
     assert {"success", "elapsed_steps", "oracle_info", "phase", "cue_steps", "delay_steps"} <= set(info)

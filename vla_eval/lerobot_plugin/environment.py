@@ -7,19 +7,17 @@ no seeds in its results. For figures use `mikasa-vla eval`.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, get_args  # lerobot and gymnasium's vector environments are untyped here
+from typing import Any  # lerobot and gymnasium's vector environments are untyped here
 
 import gymnasium as gym
 import numpy as np
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs import EnvConfig
 from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
-from numpy.typing import NDArray
 
-from vla_eval.config.environment import EnvSettings, RenderSettings, WristMesh
-from vla_eval.config.prompts import instruction_for
-from vla_eval.core import SimEnv, StepResult
-from vla_eval.envs.factory import describe_env, make_env
+from vla_eval.config.environment import EnvSettings
+from vla_eval.core import StepResult
+from vla_eval.envs.gymnasium_env import TaskEnv, render_settings
 from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
 from vla_eval.features import (
     ACTION_KEY,
@@ -34,21 +32,19 @@ from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
 
-SLOT = 0  # one episode at a time; LeRobot makes a vector of such environments
 PIXELS, AGENT_POS = "pixels", "agent_pos"
 CAMERA_NAMES = {camera: key.rpartition(".")[2] for camera, key in CAMERA_KEYS.items()}
 """Camera of the environment -> name under `pixels`; lerobot puts `observation.images.` before it."""
 SUITE = "mikasa"
 
 
-class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
+class MikasaGym(TaskEnv):
     """One task as a Gymnasium environment, under the names that lerobot reads.
 
     Observation: `pixels` with `base` and `wrist`, (H, W, 3) uint8 RGB, of 128 pixels or the argument
     `image_size`; `agent_pos`, (10,) or (25,) float32, as the recorder computes it. Action: float32, by
     default (7,) in [-1, 1] of `pd_ee_delta_pose`; the argument `control_mode` chooses another.
-    `is_success` is in each step's info. An episode ends at its first success, when it is lost, or at
-    the task's horizon. The simulator is built at the first reset: in the process that needs it.
+    `is_success` is in each step's info. Its episodes are those of `TaskEnv`.
 
     Args:
         state: which proprioception `agent_pos` is.
@@ -56,30 +52,21 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
         seed_offset: added to the seeds that LeRobot gives.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": FPS}  # noqa: RUF012  gymnasium declares it so
-
     def __init__(
         self, settings: EnvSettings, *, state: StateKind, prompt_set: str, seed_offset: int = 0
     ) -> None:
-        row = task_spec(settings.task)
-        self._settings = settings
+        super().__init__(settings, prompt_set=prompt_set)
         self._state, self._seed_offset = state, seed_offset
-        self._env: SimEnv | None = None
-        self._result: StepResult | None = None
-        self.task = row.id
-        self.task_description = instruction_for(row, prompt_set)
-        offered = describe_env(settings)
-        self._max_episode_steps = offered.horizon_steps
-        self.render_mode = "rgb_array"
-        image = gym.spaces.Box(0, 255, _image_shape(offered), np.uint8)
+        self.task = self._next.task
+        self.task_description = self._next.instruction
+        self._max_episode_steps = self.offered.horizon_steps
+        image = gym.spaces.Box(0, 255, _image_shape(self.offered), np.uint8)
         self.observation_space = gym.spaces.Dict(
             {
                 PIXELS: gym.spaces.Dict(dict.fromkeys(CAMERA_NAMES.values(), image)),
                 AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES[state]),), np.float32),
             }
         )
-        low, high = (np.array(bound, np.float32) for bound in (offered.action.low, offered.action.high))
-        self.action_space = gym.spaces.Box(low, high, dtype=np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -94,39 +81,10 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
                 f"{self.task}: reset without a seed. An episode is a function of its seed; give lerobot one "
                 "with --seed."
             )
-        super().reset(seed=seed)
-        drawn = int(self.np_random.integers(2**31)) if seed is None else seed + self._seed_offset
-        if self._env is None:
-            self._env = make_env(self._settings)
-        self._result = self._env.reset({SLOT: drawn}, render=True)[SLOT]
-        return self._observation(self._result), {"is_success": False}
+        return super().reset(seed=seed, options=options)
 
-    def step(self, action: NDArray[Any]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """Execute one control step; what lies beyond the bounds is clipped."""
-        if self._env is None:
-            raise gym.error.ResetNeeded(f"{self.task}: call reset() before step().")
-        actions = {SLOT: np.asarray(action, dtype=np.float32)}
-        self._result = result = self._env.step(actions, render=frozenset({SLOT}))[SLOT]
-        success = result.status.success
-        return (
-            self._observation(result),
-            float(result.reward),
-            success or result.status.fail,
-            result.observation.step >= self._max_episode_steps,
-            {"is_success": success},
-        )
-
-    def render(self) -> NDArray[np.uint8]:
-        """Return the base camera's last image, (H, W, 3)."""
-        if self._result is None:
-            raise gym.error.ResetNeeded(f"{self.task}: call reset() before render().")
-        return self._result.observation.images[next(iter(CAMERA_NAMES))].copy()
-
-    def close(self) -> None:
-        """Release the simulator."""
-        if self._env is not None:
-            self._env.close()
-            self._env = None
+    def _seed_of(self, seed: int) -> int:
+        return seed + self._seed_offset
 
     def _observation(self, result: StepResult) -> dict[str, Any]:
         seen = result.observation
@@ -134,6 +92,9 @@ class MikasaGym(gym.Env[dict[str, Any], NDArray[Any]]):
             PIXELS: {name: seen.images[camera].copy() for camera, name in CAMERA_NAMES.items()},
             AGENT_POS: proprioception(seen.state)[self._state].astype(np.float32),
         }
+
+    def _info(self, result: StepResult) -> dict[str, Any]:
+        return {"is_success": result.status.success}
 
 
 def _image_shape(offered: EnvSpec) -> tuple[int, int, int]:
@@ -222,7 +183,7 @@ class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
             kwargs=dict(self.env_kwargs),
             simulator=self.simulator,  # type: ignore[arg-type]  # draccus knows no Literal; `make_env` checks
             sim_backend=self.sim_backend,  # type: ignore[arg-type]  # likewise
-            render=_render_settings(self.wrist_mesh, self.render_backend),
+            render=render_settings(self.wrist_mesh, self.render_backend),
             cameras=tuple(CAMERA_NAMES),
         )
         return functools.partial(
@@ -239,14 +200,6 @@ def _state_kind(name: str) -> StateKind:
         if kind == name:
             return kind
     raise unknown_name("kind of state", name, STATE_NAMES, where="env.state")
-
-
-def _render_settings(wrist_mesh: str, backend: str) -> RenderSettings:
-    meshes: tuple[WristMesh, ...] = get_args(WristMesh)
-    for mesh in meshes:
-        if mesh == wrist_mesh:
-            return RenderSettings(wrist_mesh=mesh, backend=backend)
-    raise unknown_name("mesh", wrist_mesh, meshes, where="env.wrist_mesh")
 
 
 def _vector(make: Callable[[], MikasaGym], n_envs: int, *, in_processes: bool) -> Any:

@@ -111,8 +111,13 @@ class TaskSpec:
 
     @property
     def gym_id(self) -> str:
-        """The id under which Gymnasium knows the task."""
+        """The id under which Gymnasium knows the task: one episode in numpy, as an evaluation has it."""
         return f"vla_eval/{self.id}"
+
+    @property
+    def maniskill_id(self) -> str:
+        """The id of the ManiSkill environment behind it: batched, torch."""
+        return f"vla_eval_maniskill/{self.id}"
 
     @property
     def has_candidates(self) -> bool:
