@@ -14,7 +14,7 @@ from vla_eval.envs.factory import make_env
 from vla_eval.errors import ConformanceError
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_hold, make_random
-from vla_eval.specs import PolicySpec
+from vla_eval.specs import EnvSpec, PolicySpec
 from vla_eval.testing import check_env, check_policy, check_task
 
 FAKE = EnvSettings(task="RememberColor3-v0", simulator="fake", cameras=("base_camera", "hand_camera"))
@@ -180,6 +180,12 @@ def _patch_is_right(image: ImageArray) -> bool:
     return bool(brightness[:half].mean() < brightness[half:].mean())
 
 
+def _small_env() -> EnvSpec:
+    """Return a specification with small images, which are quick to make."""
+    spec: EnvSpec = make_env(FAKE).spec
+    return replace(spec, cameras=tuple(replace(one, height_px=16, width_px=16) for one in spec.cameras))
+
+
 # What is left of an observation is one bit: a policy that compares two things, or counts cubes of a colour.
 BITS: dict[str, Callable[[ImageArray, FloatArray, str], bool]] = {
     "more red than green": lambda image, _state, _sentence: image[..., 0].mean() > image[..., 1].mean(),
@@ -234,19 +240,19 @@ class OneBit:
 def test_one_memory_for_all_slots_is_noticed_whatever_is_left_of_an_observation(
     bit: str, memory: str
 ) -> None:
-    env: Any = make_env(FAKE)
-    check_policy(lambda: OneBit(bit, memory, is_shared=False), env.spec)
+    env = _small_env()
+    check_policy(lambda: OneBit(bit, memory, is_shared=False), env)
     with pytest.raises(ConformanceError, match=r"Keep your state by `window\.slot`"):
-        check_policy(lambda: OneBit(bit, memory, is_shared=True), env.spec)
+        check_policy(lambda: OneBit(bit, memory, is_shared=True), env)
 
 
 @pytest.mark.parametrize("chunk_size", [4, 8])
 @pytest.mark.parametrize("memory", ["the first", "the one before", "how often"])
 @pytest.mark.parametrize("bit", BITS)
 def test_it_is_noticed_in_longer_chunks(bit: str, memory: str, chunk_size: int) -> None:
-    env: Any = make_env(FAKE)
+    env = _small_env()
     with pytest.raises(ConformanceError, match=r"Keep your state by `window\.slot`"):
-        check_policy(lambda: OneBit(bit, memory, is_shared=True, chunk_size=chunk_size), env.spec)
+        check_policy(lambda: OneBit(bit, memory, is_shared=True, chunk_size=chunk_size), env)
 
 
 def test_a_policy_that_knows_one_sentence_is_checked_with_it_and_that_is_said() -> None:
@@ -256,8 +262,8 @@ def test_a_policy_that_knows_one_sentence_is_checked_with_it_and_that_is_said() 
                 {"pick up the red cube": 0}[episode.instruction]
             super().reset(episodes)
 
-    env: Any = make_env(FAKE)
-    met = check_policy(lambda: KnowsOne("bright", "the first", is_shared=False), env.spec)
+    env = _small_env()
+    met = check_policy(lambda: KnowsOne("bright", "the first", is_shared=False), env)
     assert any(line.startswith("Not tried: episodes with different sentences") for line in met)
     with pytest.raises(ConformanceError, match="Keep your state"):
-        check_policy(lambda: KnowsOne("bright", "the first", is_shared=True), env.spec)
+        check_policy(lambda: KnowsOne("bright", "the first", is_shared=True), env)
