@@ -35,6 +35,8 @@ from vla_eval.seeding import seed_global_generators
 from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.viz.capture import EpisodeCapture
+from vla_eval.viz.filming import film_again
+from vla_eval.viz.tape import EpisodeTape
 from vla_eval.workers.inside import Heartbeat
 from vla_eval.workers.messages import DeviceFound, Failed, Notice, describe_error, own_line
 
@@ -97,6 +99,7 @@ class EpisodeRunner:
         self._heartbeat = heartbeat
         self._tell = tell
         self._env: SimEnv | None = None
+        self._filming_env: SimEnv | None = None
         self._policy: Policy | None = None
         self._n_told = 0  # sentences that the parent knows of
 
@@ -128,9 +131,10 @@ class EpisodeRunner:
 
     def close(self) -> None:
         """Release the simulator."""
-        if self._env is not None:
-            self._env.close()
-        self._env = self._policy = None
+        for env in (self._env, self._filming_env):
+            if env is not None:
+                env.close()
+        self._env = self._filming_env = self._policy = None
 
     def _run(self, env: SimEnv, policy: Policy, batch: EpisodeBatch) -> Finished:
         group = batch.group
@@ -148,15 +152,34 @@ class EpisodeRunner:
         ]
         # By the episode of slot 0, even if it has a result already and is not in the batch.
         seed_global_generators("episodes", group.key.task, batch.jobs[0].run, starts[0].seed - starts[0].slot)
-        tapes = self._capture.tapes(starts) if self._capture else None
+        tapes = self._capture.tapes(starts, with_images=self._is_live(group)) if self._capture else None
         count = _StepCount(self._heartbeat, functools.partial(self._tell_sentences, group, policy))
         observers: list[StepObserver] = [count, *([tapes] if tapes else [])]
         records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
+        timings = self._heartbeat.timings([job.key for job in batch.jobs])
         if self._capture and tapes:
-            self._capture.write(starts, tapes, named, env=env.spec, heartbeat=self._heartbeat)
-        return Finished(records=named, timings=self._heartbeat.timings([job.key for job in batch.jobs]))
+            self._capture.write(
+                starts,
+                tapes,
+                named,
+                env=env.spec,
+                heartbeat=self._heartbeat,
+                film=lambda tape: tape if self._is_live(group) else self._filmed(tape, group, env.spec),
+            )
+        return Finished(records=named, timings=timings)
+
+    def _is_live(self, group: EpisodeGroup) -> bool:
+        """Whether images are captured while episodes run."""
+        return self._capture is not None and not self._capture.films_afterwards(group.env)
+
+    def _filmed(self, tape: EpisodeTape, group: EpisodeGroup, spec: EnvSpec) -> EpisodeTape:
+        """Run an episode again, in an environment of its own that renders what is captured."""
+        if self._filming_env is None:
+            self._heartbeat("setup")
+            self._filming_env = make_env(dataclasses.replace(self._captured(group, spec), n_slots=1))
+        return film_again(tape, self._filming_env, self._heartbeat)
 
     def _tell_sentences(self, group: EpisodeGroup, policy: Policy) -> None:
         """Tell the parent what the policy has read of sentences that are new."""
@@ -185,14 +208,16 @@ class EpisodeRunner:
         return self._env, self._policy
 
     def _settings_for(self, group: EpisodeGroup, policy: Policy, facts: EnvFacts) -> EnvSettings:
-        """Return what the policy needs, and what is captured, which the loop does not give to the policy."""
-        if self._capture is None:
-            return dataclasses.replace(
-                group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged
-            )
+        """Return what the policy needs; and what is captured, which the loop does not give to it."""
+        if self._is_live(group):
+            return self._captured(group, facts.spec)
+        return dataclasses.replace(group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged)
+
+    def _captured(self, group: EpisodeGroup, spec: EnvSpec) -> EnvSettings:
+        assert self._capture is not None
         return dataclasses.replace(
             group.env,
-            cameras=tuple(camera.name for camera in facts.spec.cameras),
+            cameras=tuple(camera.name for camera in spec.cameras),
             privileged=True,
             human_camera_stride=self._capture.config.frame_stride,
         )

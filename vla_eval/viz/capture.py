@@ -7,11 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, Stage
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
-from vla_eval.viz.tape import Tapes
+from vla_eval.viz.tape import EpisodeTape, Tapes
+
+BY_OUTCOME = frozenset({"none", "failures", "successes"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,13 +25,20 @@ class EpisodeCapture:
     folder: Path
     seed_start: int
 
+    def films_afterwards(self, env: EnvSettings) -> bool:
+        """Whether episodes run without the captures' images, and those that are wanted again, to be filmed.
+
+        So it is where the outcome decides, and where the same actions give the same episode to the bit.
+        """
+        return env.sim_backend == "cpu" and {self.config.video, self.config.rrd} <= BY_OUTCOME
+
     def load(self) -> None:
         """Import the writers while the worker is being set up: it takes seconds."""
         for which, writer in ((self.config.video, "video"), (self.config.rrd, "rerun_log")):
             if which != "none":
                 importlib.import_module(f"vla_eval.viz.{writer}")
 
-    def tapes(self, starts: Sequence[EpisodeStart]) -> Tapes | None:
+    def tapes(self, starts: Sequence[EpisodeStart], *, with_images: bool) -> Tapes | None:
         """Return the observer of a batch; None if no episode of it can be captured."""
         slots = {
             start.slot
@@ -38,7 +48,8 @@ class EpisodeCapture:
                 for which in (self.config.video, self.config.rrd)
             )
         }
-        return Tapes(slots, frame_stride=self.config.frame_stride) if slots else None
+        stride = self.config.frame_stride
+        return Tapes(slots, frame_stride=stride, with_images=with_images) if slots else None
 
     def write(
         self,
@@ -48,17 +59,23 @@ class EpisodeCapture:
         *,
         env: EnvSpec,
         heartbeat: Callable[[Stage], None],
+        film: Callable[[EpisodeTape], EpisodeTape],
     ) -> None:
         """Write the captures of a finished batch; its starts and records are in the same order.
 
-        `heartbeat` is called before each file: the watchdog gives each the time of a step. A file that cannot
+        `film` returns the tape of an episode with images; it is called for those that are wanted. `heartbeat`
+        is called before each file: the watchdog gives each the time of a step. A file that cannot
         be written is a `ViewingError`.
         """
         for start, record in zip(starts, records, strict=True):
             tape = tapes.episodes.get(start.slot)
-            if tape is None:
+            for_video, for_rrd = (
+                self._wants(which, record) for which in (self.config.video, self.config.rrd)
+            )
+            if tape is None or not (for_video or for_rrd):
                 continue
-            if self._wants(self.config.video, record):
+            tape = film(tape)
+            if for_video:
                 # Here and not above: a worker that writes no video need not wait for the encoder.
                 from vla_eval.viz.video import write_video
 
@@ -71,7 +88,7 @@ class EpisodeCapture:
                     stills=stills_file(self.folder, record),
                     frame_rate_hz=env.control_hz / self.config.frame_stride,
                 )
-            if self._wants(self.config.rrd, record):
+            if for_rrd:
                 from vla_eval.viz.rerun_log import write_rrd
 
                 heartbeat("step")

@@ -1,8 +1,7 @@
 """Record episodes in memory as they run: a `StepObserver`, from which videos and rerun files are made.
 
-Which episodes are kept is often known only at the end (`failures`), so a whole episode is held in memory
-until then: 0.9 MB per captured step with the three cameras of the tasks. Running the episode a second time
-would cost all of its inferences again, and on a GPU it need not give the same episode.
+A whole episode is held in memory until it ends: 0.9 MB per captured step with the three cameras of the tasks.
+Without images, an episode whose outcome decides whether it is filmed takes a few kB; `filming` runs it again.
 """
 
 from collections.abc import Collection
@@ -52,15 +51,17 @@ class EpisodeTape:
 class Tapes:
     """A `StepObserver` that keeps the episodes of some slots, with images at a stride and at the end."""
 
-    def __init__(self, slots: Collection[int], *, frame_stride: int) -> None:
+    def __init__(self, slots: Collection[int], *, frame_stride: int, with_images: bool = True) -> None:
         self._slots = slots
         self._frame_stride = frame_stride
+        self._with_images = with_images
         self._horizons: set[int] = set()
         self.episodes: dict[int, EpisodeTape] = {}
 
     def wants_images(self, step: int) -> bool:
         """Whether an image is due."""
-        return step % self._frame_stride == 0 or step in self._horizons
+        is_due = step % self._frame_stride == 0 or step in self._horizons
+        return self._with_images and is_due
 
     def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
         """Begin an episode."""

@@ -1,0 +1,52 @@
+"""Run an episode again with the actions it had, this time with images. The policy is not asked again."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from vla_eval.core import SimEnv, Stage, StepResult
+from vla_eval.errors import ViewingError
+from vla_eval.viz.tape import EpisodeTape, TapedStep
+
+
+def film_again(
+    tape: EpisodeTape, env: SimEnv, heartbeat: Callable[[Stage], None] = lambda _stage: None
+) -> EpisodeTape:
+    """Return the tape of an episode with images at its stride, and at the horizon.
+
+    Args:
+        tape: the episode, without images.
+        env: an environment with the same settings that also renders what is captured; slot 0 is used.
+        heartbeat: called with what is about to be done, for a watchdog.
+
+    Raises:
+        ViewingError: the same actions gave another episode.
+    """
+    filmed = EpisodeTape(start=tape.start, frame_stride=tape.frame_stride, chunks=tape.chunks)
+    for one in tape.steps:
+        if one.action is None:
+            heartbeat("reset")
+            result = env.reset({0: tape.start.seed}, render=True)[0]
+        else:
+            heartbeat("step")
+            is_due = one.step % tape.frame_stride == 0 or one.step == tape.start.horizon_steps
+            result = env.step({0: one.action}, render=frozenset({0} if is_due else ()))[0]
+        if not _is_same(one.result, result):
+            raise ViewingError(
+                f"{tape.start.task}, run {tape.start.run}, seed {tape.start.seed}: run again with the same "
+                f"actions to be filmed, the episode is another one from control step {one.step} on. So this "
+                "simulator does not repeat an episode. Capture it while it runs: `all`, or a number of "
+                "episodes, for --capture-video or --capture-rrd."
+            )
+        filmed.steps.append(TapedStep(step=one.step, action=one.action, result=result))
+    return filmed
+
+
+def _is_same(first: StepResult, second: StepResult) -> bool:
+    """Whether two results are equal to the bit, but for images and what privileged policies are told."""
+    states, others = first.observation.state, second.observation.state
+    return (
+        (first.status, first.reward, first.wording) == (second.status, second.reward, second.wording)
+        and states.keys() == others.keys()
+        and all(np.array_equal(states[name], others[name]) for name in states)
+    )
