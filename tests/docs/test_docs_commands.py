@@ -7,6 +7,7 @@ import argparse
 import importlib
 import re
 import shlex
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import find_recipe, load_recipe
 from vla_eval.config.policy import PolicyRecipe
+from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.evaluation.model_table import is_model_table, load_model_table
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.arguments import check_arguments
@@ -156,14 +158,46 @@ def _flags(verb: str) -> set[str]:
     return flags
 
 
-def test_the_marked_commands_of_the_tutorial_run_on_the_fake_simulator(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+MARKED = [one for one in OURS if one.mark == "run"]
+STAND_INS = ("DIR", *(f"runs/{name}" for name in ("shell", "intercept", "color3", "color5", "color9")))
+TRAININGS = tuple(f"runs/seed{number}" for number in range(3))
+CONTENTS = {
+    "docs/tutorial.md": {"list", "show", "eval", "report", "compare"},
+    "docs/your_checkpoint.md": {"checkpoint", "check", "eval", "report"},
+}
+"""Pages whose commands are run in their order -> verbs that are among them."""
+
+
+@pytest.mark.parametrize("page", CONTENTS)
+def test_the_marked_commands_of_a_page_run_on_the_fake_simulator(
+    page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    marked = [one for one in OURS if one.mark == "run"]
-    assert {one.words[1] for one in marked} >= {"list", "show", "eval", "report", "compare"}
+    marked = [one for one in MARKED if one.page == page]
+    assert {one.words[1] for one in marked} >= CONTENTS[page]
     monkeypatch.chdir(tmp_path)
+    for name in (*STAND_INS, *TRAININGS):  # the page's checkpoints: each another one
+        shutil.copytree(ROOT / "checkpoints" / "memory_color3", name)
+        (Path(name) / "name.txt").write_text(name)
     for command in marked:
-        small = ("--episodes", "2", "--workers", "1", "--set", "simulator=fake")
-        words = (*command.words[1:], *(small if command.words[1] == "eval" else ()))
+        words = [*command.words[1:], *(_small(command) if command.words[1] == "eval" else ())]
         assert main(words) == 0, f"{command}\n{capsys.readouterr().err}"
         assert capsys.readouterr().out
+
+
+def _small(command: Command) -> tuple[str, ...]:
+    one_row = ("--task", "RememberColor3-v0", "--set", "n_action_steps=[4]")
+    is_large = "--protocol" in command.words
+    return ("--episodes", "2", "--workers", "1", "--set", "simulator=fake", *(one_row if is_large else ()))
+
+
+def test_each_marked_command_is_on_a_page_that_is_run() -> None:
+    assert {one.page for one in MARKED} == set(CONTENTS)
+
+
+def test_the_configuration_of_the_page_about_your_checkpoint_is_read() -> None:
+    page = (ROOT / "docs" / "your_checkpoint.md").read_text(encoding="utf-8")
+    (data,) = (yaml.safe_load(text) for text in re.findall(r"```yaml\n(.*?)```", page, re.S))
+    fill_from_protocol(data)
+    config = decode(EvalConfig, data, where="docs/your_checkpoint.md")
+    assert {f"mine:{task}" for task in config.tasks} == {one.partition("=")[0] for one in config.policies[:5]}
+    assert set(re.findall(r"runs/\w+", " ".join(config.policies))) < {*STAND_INS, *TRAININGS}

@@ -88,6 +88,18 @@ def test_pages_from_the_disk_are_searched(site: Path, browser: Browser) -> None:
     assert [url for url in browser.requests if not url.startswith(("file:", "data:"))] == []
 
 
+@pytest.mark.browser
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine")
+def test_no_block_of_the_reference_is_cut(site: Path, browser: Browser) -> None:
+    cut = "[...document.querySelectorAll('pre code')].filter(one => one.scrollWidth > one.clientWidth).length"
+    pages = sorted((site / "reference").rglob("*.html"))
+    assert len(pages) > 10
+    for page in pages:
+        browser.open(page, width=1400)
+        assert (page.name, browser.ask(cut)) == (page.name, 0)
+
+
 def test_pages_load_nothing_from_elsewhere(site: Path) -> None:
     loads = re.compile(
         r'<(?:script|img|iframe)[^>]+src="(?:https?:)?//|<link[^>]+rel="stylesheet"[^>]+href="https?:'
