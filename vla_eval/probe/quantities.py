@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from scipy import stats
+import scipy
 
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import CONFIDENCE, Interval, PairCounts, mcnemar_exact, wilson_interval
@@ -162,7 +162,7 @@ def _sign_test(pairs: Sequence[Pair]) -> float | None:
         for pair in pairs
     )
     n_told = n_follow + n_against
-    return min(1.0, float(stats.binomtest(n_follow, n_told).pvalue)) if n_told else 1.0
+    return min(1.0, float(scipy.stats.binomtest(n_follow, n_told).pvalue)) if n_told else 1.0
 
 
 def paired_p(pairs: Sequence[Pair]) -> float | None:
@@ -177,7 +177,7 @@ def wilson_of_rate(rate: float, n: int) -> Interval:
     Of such means, those of zeros and ones vary most, so the interval is conservative. Source: as
     `wilson_interval`, which takes whole numbers of successes.
     """
-    z = float(stats.norm.ppf((1 + CONFIDENCE) / 2))
+    z = float(scipy.stats.norm.ppf((1 + CONFIDENCE) / 2))
     middle = rate + z * z / (2 * n)
     half = z * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     scale = 1 + z * z / n

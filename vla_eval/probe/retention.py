@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import optimize
 
 from vla_eval.results.estimates import CONFIDENCE, LEVEL, Interval, p_above, wilson_interval
 
@@ -69,7 +69,7 @@ def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | Non
 
 def _halved_at(delays: Sequence[int], rates: NDArray[np.float64], chance: float) -> float:
     """Return the delay at which the curve falls to the middle between its beginning and chance."""
-    fitted = optimize.isotonic_regression(rates, increasing=False).x
+    fitted = scipy.optimize.isotonic_regression(rates, increasing=False).x
     middle = (float(fitted[0]) + chance) / 2
     if fitted[0] <= chance:  # of a bootstrap draw: nothing above chance, so nothing lasts
         return float(delays[0])

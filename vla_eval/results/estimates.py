@@ -10,7 +10,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from scipy import stats
+import scipy
 
 CONFIDENCE = 0.95
 LEVEL = 0.05  # of tests
@@ -69,7 +69,7 @@ def wilson_interval(n_success: int, n_episodes: int) -> Interval | None:
     """
     if n_episodes == 0:
         return None
-    found = stats.binomtest(n_success, n_episodes).proportion_ci(CONFIDENCE, method="wilson")
+    found = scipy.stats.binomtest(n_success, n_episodes).proportion_ci(CONFIDENCE, method="wilson")
     return Interval(float(found.low), float(found.high))
 
 
@@ -103,8 +103,8 @@ def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
         return RunsEstimate(mean=mean, sem=None, interval=None)
     if min(run_means) == max(run_means):  # exact, because rounding would give a spread of 1e-17
         return RunsEstimate(mean=run_means[0], sem=0.0, interval=Interval(run_means[0], run_means[0]))
-    sem = float(stats.sem(run_means))
-    half_width = float(stats.t.ppf((1 + CONFIDENCE) / 2, n_runs - 1)) * sem
+    sem = float(scipy.stats.sem(run_means))
+    half_width = float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, n_runs - 1)) * sem
     interval = Interval(max(0.0, mean - half_width), min(1.0, mean + half_width))
     return RunsEstimate(mean=mean, sem=sem, interval=interval)
 
@@ -121,7 +121,7 @@ def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
     if counts.n_pairs == 0:
         return None
     n_different = counts.only_first + counts.only_second
-    p_value = float(stats.binomtest(counts.only_first, n_different).pvalue) if n_different else 1.0
+    p_value = float(scipy.stats.binomtest(counts.only_first, n_different).pvalue) if n_different else 1.0
     difference = (counts.only_first - counts.only_second) / counts.n_pairs
     return PairedTest(difference=difference, interval=paired_interval(counts), p_value=min(1.0, p_value))
 
@@ -181,7 +181,7 @@ def p_above(n_success: int, n_episodes: int, rate: float) -> float:
     """
     if n_episodes == 0:
         return 1.0
-    return float(stats.binomtest(n_success, n_episodes, rate, alternative="greater").pvalue)
+    return float(scipy.stats.binomtest(n_success, n_episodes, rate, alternative="greater").pvalue)
 
 
 def p_more(first: tuple[int, int], second: tuple[int, int]) -> float:
@@ -192,7 +192,7 @@ def p_more(first: tuple[int, int], second: tuple[int, int]) -> float:
     Source: Fisher's one-sided exact test, computed by scipy.stats.fisher_exact.
     """
     table = [[n_success, n_episodes - n_success] for n_success, n_episodes in (first, second)]
-    return float(stats.fisher_exact(table, alternative="greater").pvalue)
+    return float(scipy.stats.fisher_exact(table, alternative="greater").pvalue)
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:

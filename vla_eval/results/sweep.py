@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from scipy import stats
+import scipy
 
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results.comparison import Comparison, Evidence, compare, gather_evidence
@@ -194,8 +194,8 @@ def episodes_to_settle(difference: float, discordance: float, *, level: float = 
     It is for the asymptotic test; the exact one needs slightly more.
     """
     psi = max(discordance, difference)
-    z_level = float(stats.norm.ppf(1 - level / 2))
-    z_power = float(stats.norm.ppf(POWER))
+    z_level = float(scipy.stats.norm.ppf(1 - level / 2))
+    z_power = float(scipy.stats.norm.ppf(POWER))
     root = z_level * math.sqrt(psi) + z_power * math.sqrt(psi - difference**2)
     return math.ceil((root / difference) ** 2)
 

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 import torch
-from scipy.stats import norm
 from torch import Tensor
 
 from vla_eval.errors import RecipeError
@@ -86,7 +86,7 @@ def gaussian_grid(gaussians: Mapping[str, Gaussian], n_bins: Sequence[int]) -> A
     edges = []
     for name, n in zip(AXES, n_bins, strict=True):
         low, high = LIMITS[name]
-        normal = norm(*gaussians[name])
+        normal = scipy.stats.norm(*gaussians[name])
         shares = _even(float(normal.cdf(low)), float(normal.cdf(high)), n)
         inner = [float(normal.ppf(share)) for share in shares[1:-1]]
         edges.append((low, *inner, high))
