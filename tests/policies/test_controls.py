@@ -120,7 +120,7 @@ def n_successes(records: list[EpisodeRecord]) -> int:
     return sum(bool(record.success_once) for record in records)
 
 
-@pytest.mark.parametrize("n_episodes", [2, pytest.param(15, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n_episodes", [1, pytest.param(15, marks=pytest.mark.slow)])
 # At K = 1 each task of the sample is played in test_conformance.py, too.
 @pytest.mark.parametrize("n_action_steps", [pytest.param(1, marks=pytest.mark.slow), 8])
 def test_oracle_is_a_ceiling_at_each_chunk_length(
@@ -182,7 +182,7 @@ def _window_with_target(result: StepResult, target: int) -> Any:
 @pytest.mark.parametrize(
     ("task", "n_episodes"),
     [
-        ("RememberColor3-v0", 20),
+        ("RememberColor3-v0", 12),
         pytest.param("RememberColor9-v0", 60, marks=pytest.mark.slow),
         pytest.param("ShellGameTouch-v0", 60, marks=pytest.mark.slow),
     ],
@@ -225,10 +225,10 @@ def test_hold_keeps_arm_and_gripper_where_they_are() -> None:
 
 
 def test_a_tour_finds_the_mug_without_memory_and_begins_at_chance() -> None:
-    records = run("ShellGameTouch-v0", "tour", range(1, 9))
-    assert n_successes(records) == 8
-    # An arm that knew would be right 8 times; by chance that many come once in 3^8 = 6,561 times.
-    assert sum(bool(record.first_choice_success) for record in records) < 8
+    records = run("ShellGameTouch-v0", "tour", range(1, 6))
+    assert n_successes(records) == 5
+    # An arm that knew would be right 5 times; by chance that many come once in 3^5 = 243 times.
+    assert sum(bool(record.first_choice_success) for record in records) < 5
     assert any((record.n_wrong_choices or 0) == 2 for record in records)
 
 
@@ -286,7 +286,7 @@ def test_staying_at_the_place_of_the_cue_wins_cube_tasks_only_where_touching_the
 
 def test_staying_over_the_ball_wins_the_shell_game() -> None:
     """The arm is nearer to its mug than to any other when they appear, so its place keeps the answer."""
-    assert n_successes(run("ShellGameTouch-v0", "cue_touch", range(1, 10))) >= 7  # by luck: 0.8 %
+    assert n_successes(run("ShellGameTouch-v0", "cue_touch", range(1, 6))) == 5  # by luck: 0.4 %
 
 
 @pytest.mark.parametrize(
@@ -294,15 +294,15 @@ def test_staying_over_the_ball_wins_the_shell_game() -> None:
 )
 def test_an_arm_that_sees_one_frame_at_a_time_meets_the_ball(task: str) -> None:
     """It is never told the ball's speed, and keeps nothing: the same frame gets the same answer."""
-    assert n_successes(run(task, "one_frame", range(101, 111))) >= 7  # the blind arm: 2 of 10 and 1 of 10
+    assert n_successes(run(task, "one_frame", range(101, 107))) >= 5  # the blind arm: 2 of 10 and 1 of 10
     unknown = {"velocity_m_s": np.full(3, np.nan)}
     assert one_frame_decides(task, hidden={"ball": unknown}) == 40
 
 
 def test_an_arm_that_sees_one_frame_at_a_time_takes_the_cube_back() -> None:
     """The cube lies on its way back. The arm is never told from where it came, and keeps nothing."""
-    # The blind arm succeeds in 11 of 30: as many as 9 of 10 come by its luck once in 1,200 times.
-    assert n_successes(run("TakeItBack-v0", "one_frame", range(101, 111))) >= 9
+    # The blind arm succeeds in 11 of 30: 6 of 6 come by its luck once in 400 times.
+    assert n_successes(run("TakeItBack-v0", "one_frame", range(101, 107))) == 6
     unknown = {"position_m": np.full(3, np.nan)}
     assert one_frame_decides("TakeItBack-v0", hidden={"first_place": unknown}) == 40
 

@@ -160,17 +160,6 @@ def test_evaluate_changes_nothing(sampled_task: str) -> None:
         assert all(torch.equal(first[key], second[key]) for key in first)
 
 
-def test_doing_nothing_never_succeeds(sampled_task: str) -> None:
-    if task_spec(sampled_task).idle_success > 0:
-        pytest.skip("documented: the ball can roll over the disc by itself")
-    env = make(sampled_task)
-    for seed in (1, 2):
-        _, info = env.reset(seed=[seed])
-        for _ in range(task_spec(sampled_task).horizon_steps):
-            assert not bool(info["success"][0])
-            *_, info = env.step(env.hold_action())
-
-
 def test_unseeded_resets_give_different_episodes() -> None:
     env = make("RememberColor9-v0")
     env.reset(seed=[1])
@@ -188,14 +177,14 @@ def test_the_same_seeds_have_independent_answers_in_different_tasks() -> None:
     def answers(task: str) -> list[int]:
         env = make(task)
         found = []
-        for seed in range(1, 41):
+        for seed in range(1, 25):
             env.reset(seed=[seed])
             found.append(int(env.target_index()[0]))
         return found
 
     three, shells = answers("RememberColor3-v0"), answers("ShellGameTouch-v0")
-    # Independent uniform answers agree in 40/3 ± 3 of 40 episodes; the bound is five deviations away.
-    assert sum(a == b for a, b in zip(three, shells, strict=True)) < 28
+    # Independent uniform answers agree in 8 ± 2.3 of 24 episodes; the bound is five deviations away.
+    assert sum(a == b for a, b in zip(three, shells, strict=True)) < 20
     assert set(three) == set(shells) == {0, 1, 2}
 
 
@@ -319,7 +308,7 @@ def test_freeze_until_choice_holds_arm_and_gripper() -> None:
 def test_phase_lengths_are_drawn_from_their_ranges_by_the_seed_alone() -> None:
     env = make("RememberColor3-v0", cue_steps=(1, 5), delay_steps=(0, 3))
     drawn = {}
-    for seed in range(1, 60):
+    for seed in range(1, 31):
         _, info = env.reset(seed=[seed])
         drawn[seed] = (int(info["cue_steps"][0]), int(info["delay_steps"][0]))
     assert {cue for cue, _ in drawn.values()} == {1, 2, 3, 4, 5}

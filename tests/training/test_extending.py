@@ -162,6 +162,7 @@ def test_a_finished_training_says_so_in_seconds_and_without_torch(recorded: Path
     run = tmp_path / "run"
     flags = [*("finetune", "--policy", "act", "--dataset", str(recorded), "--allow-unreplayed")]
     flags += ["--device", "cpu", "--steps", "2", "--batch-size", "2", "--out", str(run)]
+    flags += ["--set", "num_workers=0"]
     small = {**tiny_trainings.TINY_ACT, "dropout": 0.1}
     flags += [word for name, value in small.items() for word in ("--set", f"policy.{name}={value}")]
     assert main(flags) == 0
