@@ -2,12 +2,13 @@
 
 import argparse
 import contextlib
+import functools
 import importlib.metadata
 import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 
 import pytest
@@ -37,13 +38,14 @@ sys.path[:] = before
 """
 HANGS_AFTER_S = 600.0
 
-IN_ONE_PROCESS = {
+WITH_LEROBOT = {
     *("record", "replay", "finetune", "doctor", "bench --loader", "bench --serve"),
     *("checkpoint verify", "checkpoint rehearse", "checkpoint merge"),
-    *("checkpoint convert-openvla", "checkpoint convert-spatialvla"),
+    *("checkpoint convert-octo", "checkpoint convert-openvla", "checkpoint convert-spatialvla"),
+    *("view", "serve"),
     *(name for name in COMMANDS if name.startswith("dataset ")),
 }
-"""Commands that import lerobot, which takes 10 s: one process, started as a command is, runs them all."""
+"""Commands that import lerobot, which takes 10 s, or read what those have made."""
 STARTED_ALIKE = {"bench --loader", "bench --serve", "probe"}
 """Commands whose processes are those of `finetune`, `eval --serve` and `eval`."""
 ENDED = "This command ended with "
@@ -72,6 +74,11 @@ if __name__ == "__main__":
 """
 
 
+@functools.cache
+def installed_modules() -> Mapping[str, list[str]]:
+    return importlib.metadata.packages_distributions()
+
+
 class Traps:
     """The folder, and what was caught in it."""
 
@@ -79,7 +86,7 @@ class Traps:
         self.work, self.folder, self._mark = folder / "work", folder / "traps", folder / "mark"
         self.work.mkdir()
         self.folder.mkdir()
-        installed = set(importlib.metadata.packages_distributions())
+        installed = set(installed_modules())
         own = {"sitecustomize", "usercustomize", "vla_eval"} | sys.stdlib_module_names
         for name in installed | (own if with_standard_library else {"multiprocessing", "selectors"}):
             if name.isidentifier():
@@ -162,18 +169,29 @@ def test_there_is_a_command_of_every_verb() -> None:
     assert {verb_of(name) for name in COMMANDS} == verbs(build_parser())
 
 
+def named(*, with_lerobot: bool) -> list[str]:
+    """Return the commands of one of the two processes that run them one after another."""
+    own = {name for name in COMMANDS if (name in WITH_LEROBOT) is with_lerobot}
+    return [name for name in COMMANDS if name in own - STARTED_ALIKE]
+
+
 @pytest.mark.parametrize(
-    "names", [COMMANDS.keys() - STARTED_ALIKE, pytest.param(COMMANDS.keys(), marks=pytest.mark.slow)], ids=len
+    ("names", "each_alone"),
+    [
+        pytest.param(named(with_lerobot=True), set(), id="with lerobot"),
+        pytest.param(named(with_lerobot=False), set(), id="without it"),
+        pytest.param(COMMANDS.keys(), COMMANDS.keys() - WITH_LEROBOT, id="all", marks=pytest.mark.slow),
+    ],
 )
 def test_no_process_of_any_verb_imports_from_the_working_directory(
-    traps: Traps, names: Collection[str]
+    traps: Traps, names: Collection[str], each_alone: Collection[str]
 ) -> None:
+    """One process, started as a command is, runs them; those that do not end have one of their own."""
     caught = {}
     with traps.one_process() as run_there:
-        for name, command in COMMANDS.items():
-            if name not in names:
-                continue
-            if name in IN_ONE_PROCESS:
+        for name in names:
+            command = COMMANDS[name]
+            if name not in each_alone and name not in ENDLESS:
                 code, said = run_there(command)
             else:
                 _, code, said = traps.run(command, until=ENDLESS.get(name))
