@@ -87,8 +87,9 @@ def code_folders() -> tuple[str, ...]:
     """Return the folders that Python searches now, and those of packages that are installed elsewhere."""
     modules = [module for name, module in tuple(sys.modules.items()) if "." not in name]
     files = [getattr(module, "__file__", None) for module in modules]
-    elsewhere = {os.path.realpath(os.path.dirname(file)) for file in files if file}
-    elsewhere -= {"/", os.path.realpath(".")}
+    here = os.getcwd()
+    elsewhere = {_resolved(os.path.join(here, os.path.dirname(file))) for file in files if file}
+    elsewhere -= {"/", os.path.realpath(here)}
     compiled = os.path.join(tempfile.gettempdir(), f"torchinductor_{_user()}")
     named = [os.environ[name] for name in COMPILED_VARIABLES if os.environ.get(name)]
     searched = (*(place or "." for place in sys.path), sys.prefix, os.path.dirname(os.__file__))
