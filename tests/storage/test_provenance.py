@@ -145,4 +145,6 @@ def test_the_nvidia_driver_version_is_read_from_both_kinds_of_module(
 
 def test_mesa_is_unknown_without_dpkg(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
+    provenance.mesa_version.cache_clear()
     assert provenance.mesa_version() is None
+    provenance.mesa_version.cache_clear()

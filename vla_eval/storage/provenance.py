@@ -4,6 +4,7 @@ Two calls on an unchanged machine give the same answer, which is how a continued
 machine or the code has changed. Nothing here names a host, a user or a folder. Standard library only.
 """
 
+import functools
 import hashlib
 import importlib.metadata
 import os
@@ -62,6 +63,7 @@ def checkout_state(package: Path) -> dict[str, str | None]:
     return {"commit": commit.decode().strip(), "changes": _digest_changes(root, diff, added)}
 
 
+@functools.cache  # what is imported stays as it is
 def package_version(name: str) -> str | None:
     """Return the version of an installed distribution, or None."""
     try:
@@ -82,6 +84,7 @@ def nvidia_driver_version() -> str | None:
     return match[1] if match else None
 
 
+@functools.cache
 def mesa_version() -> str | None:
     """Return the version of Mesa's Vulkan drivers where dpkg knows it, such as `25.0.7-2~bpo12+1`."""
     if shutil.which("dpkg-query") is None:
