@@ -4,7 +4,7 @@ The source is read, not imported: importing it would start a simulator.
 """
 
 import ast
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
 from importlib.util import find_spec, resolve_name
 from pathlib import Path
@@ -81,11 +81,18 @@ def _module(name: str) -> _Module:
             resolve_name("." * node.level + (node.module or ""), package),
             alias.name,
         )
-        for node in ast.walk(tree)
+        for node in _outside_of_definitions(tree.body)
         if isinstance(node, ast.ImportFrom)
         for alias in node.names
     }
     return _Module(tree.body, imported)
+
+
+def _outside_of_definitions(nodes: Iterable[ast.AST]) -> Iterator[ast.AST]:
+    for node in nodes:
+        yield node
+        if isinstance(node, ast.If | ast.Try | ast.ExceptHandler | ast.With):
+            yield from _outside_of_definitions(ast.iter_child_nodes(node))
 
 
 def _classes(module_name: str, class_name: str) -> Iterator[tuple[str, ast.ClassDef]]:

@@ -5,6 +5,7 @@ import gc
 import importlib
 import os
 
+from vla_eval.lock.state import code_folders
 from vla_eval.workers.guard import end_with_parent
 
 IMPORTS_VARIABLE = "MIKASA_VLA_WORKER_IMPORTS"
@@ -23,6 +24,7 @@ def import_for_workers() -> None:
     for name in filter(None, os.environ.get(IMPORTS_VARIABLE, "").split(":")):
         with contextlib.suppress(Exception):
             importlib.import_module(name)
+    code_folders()  # resolves the folder of each module, so that no worker has to
     gc.freeze()
     gc.enable()
 
