@@ -3,7 +3,7 @@
 import pytest
 
 from vla_eval.cli.terminal.episode_bar import EpisodeBar
-from vla_eval.cli.terminal.progress import load_text
+from vla_eval.cli.terminal.progress import load_text, success_text
 from vla_eval.workers.load import Load, MachineLoad
 
 
@@ -116,3 +116,9 @@ def test_steps_of_an_episode_are_counted_once_when_it_ends(capsys: pytest.Captur
     bar.advance(n_done=1, n_steps=60)
     bar.close()
     assert "1/2 episodes (102 control steps)" in capsys.readouterr().err
+
+
+def test_success_is_of_each_policy_and_left_out_where_there_are_many() -> None:
+    assert success_text({}) == "no result yet, "
+    assert success_text({"mine": [True, False], "oracle": [True]}) == "success mine 0.50, oracle 1.00; "
+    assert success_text({f"policy{index}": [True] for index in range(5)}) == ""

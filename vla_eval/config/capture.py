@@ -36,6 +36,13 @@ class CaptureConfig:
         """Whether anything is captured."""
         return self.video != "none" or self.rrd != "none"
 
+    def films_afterwards(self, sim_backend: str) -> bool:
+        """Whether episodes run without images for it, and those that are wanted once more, to be filmed.
+
+        So it is where the outcome alone decides, and the same actions give the same episode to the bit.
+        """
+        return sim_backend == "cpu" and {self.video, self.rrd} <= {"none", "failures", "successes"}
+
 
 def may_be_wanted(which: Which, *, run: int, index: int) -> bool:
     """Return whether the episode of a run with its seed of this index, from 0, may have to be captured."""

@@ -172,7 +172,7 @@ class EpisodeRunner:
 
     def _is_live(self, group: EpisodeGroup) -> bool:
         """Whether images are captured while episodes run."""
-        return self._capture is not None and not self._capture.films_afterwards(group.env)
+        return self._capture is not None and not self._capture.config.films_afterwards(group.env.sim_backend)
 
     def _filmed(self, tape: EpisodeTape, group: EpisodeGroup, spec: EnvSpec) -> EpisodeTape:
         """Run an episode again, in an environment of its own that renders what is captured."""

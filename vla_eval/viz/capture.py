@@ -7,14 +7,11 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
-from vla_eval.config.environment import EnvSettings
 from vla_eval.core import EpisodeStart, Stage
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
 from vla_eval.viz.tape import EpisodeTape, Tapes
-
-BY_OUTCOME = frozenset({"none", "failures", "successes"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,13 +21,6 @@ class EpisodeCapture:
     config: CaptureConfig
     folder: Path
     seed_start: int
-
-    def films_afterwards(self, env: EnvSettings) -> bool:
-        """Whether episodes run without the captures' images, and those that are wanted again, to be filmed.
-
-        So it is where the outcome decides, and where the same actions give the same episode to the bit.
-        """
-        return env.sim_backend == "cpu" and {self.config.video, self.config.rrd} <= BY_OUTCOME
 
     def load(self) -> None:
         """Import the writers while the worker is being set up: it takes seconds."""

@@ -4,7 +4,7 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +29,7 @@ STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 STDERR = 2
 ANSWER_TO_STOP = "Stopping after this step, with a checkpoint. Once more: at once, without one."
 """Of a training."""
+MAX_RATES = 4  # policies whose success a line shows
 MEGABYTES_PER_FRAME = 0.9  # 3 × (512² + 2 × 128²) bytes
 
 
@@ -106,13 +107,29 @@ def evaluate_with_progress(
         progress.close()
 
 
-def capture_cost(capture: CaptureConfig) -> str:
+def capture_cost(capture: CaptureConfig, *, sim_backend: str) -> str:
     """Return what capturing takes, before it begins."""
+    if capture.films_afterwards(sim_backend):
+        return (
+            "capturing: episodes are filmed after they have run, with the same actions, if their outcome is "
+            f"the one that is wanted: every {capture.frame_stride} control steps an image of 512 × 512 and "
+            "two of 128 × 128."
+        )
     return (
         f"capturing: every {capture.frame_stride} control steps an image of 512 × 512 and two of 128 × 128, "
         f"also for policies that read none; {MEGABYTES_PER_FRAME} MB of memory each until the episode is "
         "over. On a CPU this is most of an episode's time: a larger capture.frame_stride costs less."
     )
+
+
+def success_text(successes: Mapping[str, Sequence[bool]]) -> str:
+    """Return the success of each policy so far; of more than a line has room for, nothing."""
+    if not successes:
+        return "no result yet, "
+    if len(successes) > MAX_RATES:
+        return ""
+    rates = [f"{policy} {sum(ended) / len(ended):.2f}" for policy, ended in successes.items()]
+    return f"success {', '.join(rates)}; "
 
 
 def load_text(load: Load, *, n_open: int) -> str:
@@ -139,7 +156,8 @@ class Progress(EvaluationObserver):
         self._out = out
         self._bar = EpisodeBar(is_quiet=lines.is_stderr)
         self._lines = EvaluationLines(lines, out=out)
-        self._n_total = self._n_done = self._n_errors = self._n_results = self._n_successes = 0
+        self._n_total = self._n_done = self._n_errors = 0
+        self._successes: dict[str, list[bool]] = {}  # policy -> of each episode that ran now
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Say how much there is to do, and what is left out."""
@@ -159,7 +177,8 @@ class Progress(EvaluationObserver):
             f"{self._out}: {n_episodes} episodes, {n_finished} of them finished before; starting {workers}"
         )
         if self._capture.is_on:
-            self._bar.write(capture_cost(self._capture))
+            sim_backend = plan.jobs[0].group.env.sim_backend
+            self._bar.write(capture_cost(self._capture, sim_backend=sim_backend))
         self._n_done, self._n_total = n_finished, n_episodes
         self._bar.begin(n_done=n_finished, n_total=n_episodes)
         self._bar.doing("starting processes, loading simulator and policies")
@@ -182,10 +201,8 @@ class Progress(EvaluationObserver):
             where = f"{record.policy} on {record.task}, seed {record.seed}, run {record.run}"
             self._bar.write(f"error: {where}: {record.error.kind}: {record.error.message}")
         else:
-            self._n_results += 1
-            self._n_successes += bool(record.success_once)
-        rate = f"success {self._n_successes / self._n_results:.2f}" if self._n_results else "no result yet"
-        note = f"{rate}, errors {self._n_errors}"
+            self._successes.setdefault(record.policy, []).append(bool(record.success_once))
+        note = f"{success_text(self._successes)}errors {self._n_errors}"
         self._bar.advance(n_done=self._n_done, n_steps=record.n_steps or 0, note=note)
 
     def on_load(self, load: Load) -> None:
