@@ -42,7 +42,6 @@ class ChunkingSettings:
     first_inference_step: Annotated[int, Bounds(0)] = 0
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, prefix="chunking.")
 
     def at(self, n_action_steps: int) -> "ChunkingSpec":
@@ -62,7 +61,6 @@ class ChunkingSpec(ChunkingSettings):
     n_action_steps: Steps
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, prefix="chunking.")
         if self.first_inference_step >= self.n_action_steps:
             raise RecipeError(
@@ -100,7 +98,6 @@ class ChunkExecutor:
     """Executes the chunks of one episode; one object per slot, emptied by `reset`."""
 
     def __init__(self, spec: ChunkingSpec) -> None:
-        """Start with no chunks."""
         self.spec = spec
         self._chunks: list[_Arrived] = []
         self._next_inference_step = spec.first_inference_step

@@ -23,7 +23,6 @@ class AppearanceSettings:
     hue_deg: Annotated[float, Bounds(-180.0, 180.0)] = 0.0
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, prefix="appearance.")
         if self.table_rgb is not None and len(self.table_rgb) != 3:
             raise RecipeError(f"appearance.table_rgb is {list(self.table_rgb)}, expected three numbers.")

@@ -21,7 +21,6 @@ class CaptureConfig:
     frame_stride: Steps = 2  # control steps from one frame to the next
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, prefix="capture.")
         for name in ("video", "rrd"):
             which = getattr(self, name)

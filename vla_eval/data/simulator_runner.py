@@ -18,7 +18,6 @@ class SimulatorRunner[J: Job, A]:
     """Answers jobs of one kind; a `workers.inside.Runner`."""
 
     def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
-        """Start with nothing made."""
         self._heartbeat, self._tell = heartbeat, tell
         self._env: SimEnv | None = None
         self._env_settings: EnvSettings | None = None

@@ -76,7 +76,6 @@ class FakeEnv:
     """
 
     def __init__(self, settings: EnvSettings) -> None:
-        """Check the arguments."""
         task = task_spec(settings.task)
         check_arguments(task, settings.kwargs, TASKS.values())
         defaults = _defaults(task)

@@ -36,13 +36,6 @@ class ManiSkillEnv:
     """`SimEnv` on ManiSkill; see the module docstring."""
 
     def __init__(self, settings: EnvSettings) -> None:
-        """Build the scenes.
-
-        Raises:
-            UnknownNameError: no such task, argument or camera.
-            TaskArgumentError: the arguments are impossible.
-            RenderingError: cameras are wanted and the renderer does not start.
-        """
         row = task_spec(settings.task)
         check_arguments(row, settings.kwargs, TASKS.values())
         kwargs = {**row.kwargs, **settings.kwargs}

@@ -42,14 +42,6 @@ class OfficialEnv:
     """`SimEnv` on the official package; see the module docstring."""
 
     def __init__(self, settings: EnvSettings) -> None:
-        """Build the scenes.
-
-        Raises:
-            UnknownNameError: no such task, argument or camera.
-            TaskArgumentError: the settings ask for what the official environments cannot do.
-            MissingDependencyError: the package, or the asset of the shell game's mug, is not installed.
-            RenderingError: cameras are wanted and the renderer does not start.
-        """
         row = task_spec(settings.task)
         check_official(settings, row)
         check_names("camera", settings.cameras, [camera.name for camera in CAMERAS], where=row.id)

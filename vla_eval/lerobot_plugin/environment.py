@@ -142,7 +142,6 @@ class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
     features_map: dict[str, str] = field(default_factory=_features_map)
 
     def __post_init__(self) -> None:
-        """Check what draccus cannot."""
         if self.max_parallel_tasks != 1:
             raise RecipeError(
                 f"env.max_parallel_tasks is {self.max_parallel_tasks}, expected 1: lerobot 0.6.1 would give "

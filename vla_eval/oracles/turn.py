@@ -51,7 +51,6 @@ class TurnExpert:
     """One episode's expert; with `imagined` it turns the peg by an angle drawn at random."""
 
     def __init__(self, *, imagined_angle_rad: float | None) -> None:
-        """Store the angle to turn by, if it is not the target angle."""
         self._imagined_angle_rad = imagined_angle_rad
         self._goal_yaw_rad: float | None = None
         self._grasp_offset_rad: float | None = None

@@ -41,7 +41,6 @@ class Row:
     run: Run | None = None
 
     def __getitem__[V](self, statistic: Statistic[V]) -> V:
-        """Return the value of a statistic."""
         return cast(V, self.estimates[statistic])
 
     @property

@@ -38,7 +38,6 @@ class RollingBallEnv(WithoutCueEnv):
         ball_radius_m: float = 0.02,
         **kwargs: Any,
     ) -> None:
-        """Check the numbers and build the scene."""
         pair = tuple(float(v) for v in velocity_range_m_s)
         if len(pair) != 2 or not 0 < pair[0] <= pair[1]:
             raise TaskArgumentError(

@@ -48,7 +48,6 @@ class ChoiceEnv(MemoryTableEnv):
         cue_after_steps: int = 0,
         **kwargs: Any,
     ) -> None:
-        """Check the threshold and build the scene."""
         if not goal_threshold_m > 0:
             raise TaskArgumentError(f"goal_threshold_m={goal_threshold_m}: expected > 0.")
         self.goal_threshold_m = goal_threshold_m

@@ -51,7 +51,6 @@ class InterceptEnv(RollingBallEnv):
     BALL_DROP_M = 0.02
 
     def __init__(self, *args: Any, goal_radius_m: float = 0.1, **kwargs: Any) -> None:
-        """Check the radius and build the scene."""
         check_positive(goal_radius_m=goal_radius_m)
         self.goal_radius_m = goal_radius_m
         super().__init__(*args, **kwargs)

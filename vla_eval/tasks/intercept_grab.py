@@ -46,7 +46,6 @@ class InterceptGrabEnv(RollingBallEnv):
     BALL_DROP_M = 0.0
 
     def __init__(self, *args: Any, lift_height_m: float = 0.0, **kwargs: Any) -> None:
-        """Check the height and build the scene."""
         if not 0 <= lift_height_m <= 0.5:
             raise TaskArgumentError(
                 f"lift_height_m={lift_height_m}: expected 0 to 0.5, what the arm reaches."

@@ -37,7 +37,6 @@ class ItemChoiceEnv(ChoiceEnv):
     """
 
     def __init__(self, *args: Any, items: tuple[Item, ...], distract_steps: int = 0, **kwargs: Any) -> None:
-        """Take the items and build the scene."""
         self.items = items
         self.distract_steps = distract_steps
         super().__init__(*args, **kwargs)

@@ -105,7 +105,6 @@ class RememberColorEnv(RememberEnv):
     def __init__(
         self, *args: Any, n_items: int = 3, cube_half_size_m: float = CUBE_HALF_SIZE_M, **kwargs: Any
     ) -> None:
-        """Check number and size of the cubes."""
         check_count("n_items", n_items, len(COLORS), "colour")
         shape = cube(cube_half_size_m)
         super().__init__(*args, items=tuple(Item(shape, color) for color in COLORS[:n_items]), **kwargs)
@@ -120,7 +119,6 @@ class RememberShapeEnv(RememberEnv):
     FAMILY = 4
 
     def __init__(self, *args: Any, n_items: int = 3, **kwargs: Any) -> None:
-        """Check the number of shapes."""
         check_count("n_items", n_items, len(SHAPES), "shape")
         shapes = list(SHAPES.values())[:n_items]
         super().__init__(*args, items=tuple(Item(shape, SHAPE_COLOR) for shape in shapes), **kwargs)
@@ -138,7 +136,6 @@ class RememberShapeAndColorEnv(RememberEnv):
     def __init__(
         self, *args: Any, n_shapes: int = 3, n_colors: int = 2, official_3x2: bool = False, **kwargs: Any
     ) -> None:
-        """Check the numbers of shapes and colours."""
         check_count("n_shapes", n_shapes, len(MIXED_SHAPES), "shape", least=1)
         check_count("n_colors", n_colors, len(MIXED_COLORS), "colour", least=1)
         if n_shapes * n_colors < 2:

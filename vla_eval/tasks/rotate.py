@@ -69,7 +69,6 @@ class RotateEnv(WithoutCueEnv):
         peg_half_width_m: float = 0.025,
         **kwargs: Any,
     ) -> None:
-        """Check the numbers and build the scene."""
         check_positive(
             angle_threshold_rad=angle_threshold_rad,
             peg_half_length_m=peg_half_length_m,

@@ -96,7 +96,6 @@ class SeveralColorsEnv(ItemChoiceEnv):
         phase_gate_success: bool = True,
         **kwargs: Any,
     ) -> None:
-        """Check the numbers and build the scene."""
         check_count("n_items", n_items, len(COLORS), "colour")
         check_count("n_shown", n_shown, n_items, "cube on the table", least=1)
         check_count("gap_steps", gap_steps, MAX_STEPS, "step", least=0)

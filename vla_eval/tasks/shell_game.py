@@ -53,7 +53,6 @@ class ShellGameEnv(ChoiceEnv):
         mug: Literal["primitive", "ycb"] = "primitive",
         **kwargs: Any,
     ) -> None:
-        """Check the choice of the mug and build the scene."""
         if mug not in ("primitive", "ycb"):
             raise TaskArgumentError(f"mug={mug!r}: expected 'primitive' or 'ycb'.")
         self.mug = mug

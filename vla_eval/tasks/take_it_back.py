@@ -66,7 +66,6 @@ class TakeItBackEnv(WithoutCueEnv):
         latch_goal_color: bool = True,
         **kwargs: Any,
     ) -> None:
-        """Check the sizes and build the scene."""
         check_positive(
             goal_radius_m=goal_radius_m, return_radius_m=return_radius_m, cube_half_size_m=cube_half_size_m
         )

@@ -56,7 +56,6 @@ class StepBatches(Sampler[list[Any]]):
         self._sampler, self._start, self._sharing, self._numbered = sampler, start, sharing, numbered
 
     def __iter__(self) -> Iterator[list[Any]]:
-        """Yield batches."""
         sharing, skipped = self._sharing, self._start.n_taken // self._per_step
         for epoch in itertools.count(self._start.epoch):
             yield from itertools.islice(self._epoch(epoch, sharing), skipped, None)
@@ -84,7 +83,6 @@ class SeededSamples(Dataset[Any]):
         self._dataset, self._run_seed = dataset, run_seed
 
     def __getitem__(self, sample: tuple[int, int, int]) -> Any:
-        """Return the sample of an index."""
         index, *place = sample
         drawn = np.random.SeedSequence(self._run_seed, spawn_key=(AUGMENTATION, *place)).generate_state(1)
         set_seed(int(drawn[0]))

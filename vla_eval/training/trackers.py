@@ -48,7 +48,6 @@ class Services:
     """The services of one training. A training does not depend on them: what fails is said once."""
 
     def __init__(self, say: Callable[[str], None]) -> None:
-        """Begin with none; `say` gets lines for a person."""
         self._say = say
         self._services: list[Service] = []
 

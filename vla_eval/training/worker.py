@@ -17,7 +17,6 @@ class FinetuneRunner:
     """Does one fine-tuning after the other."""
 
     def __init__(self, heartbeat: Heartbeat, _tell: Callable[[Notice], None]) -> None:
-        """Start with nothing made."""
         self._heartbeat = heartbeat
 
     def answer(self, job: FinetuneJob) -> Finetuned | Failed:

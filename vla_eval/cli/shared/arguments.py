@@ -264,6 +264,5 @@ class _OldFlag(argparse.Action):
         values: str | Sequence[Any] | None,  # Any: argparse's own annotation
         option_string: str | None = None,
     ) -> None:
-        """Store and warn."""
         warn_renamed(str(option_string), self.const)
         setattr(namespace, self.dest, values)

@@ -103,7 +103,6 @@ class EvaluationLines:
     """The lines of an evaluation; its methods are those of `EvaluationObserver`."""
 
     def __init__(self, lines: JsonLines, *, out: Path) -> None:
-        """Take the lines and the run folder."""
         self._count = _Count(lines, str(out), None)
         self._lines = lines
         self._folder = out
@@ -173,7 +172,6 @@ class PhaseLines:
     """The lines of a recording or a replay, phase by phase."""
 
     def __init__(self, lines: JsonLines) -> None:
-        """Take the lines."""
         self._lines = lines
         self._count = _Count(lines, "", None)
 

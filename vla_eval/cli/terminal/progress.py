@@ -149,7 +149,6 @@ class Progress(EvaluationObserver):
     def __init__(
         self, stop: StopRequest, *, out: Path, capture: CaptureConfig, json_progress: int | None = None
     ) -> None:
-        """Take the request to stop, the run folder, what is captured, and where lines for programs go."""
         lines = JsonLines(json_progress)
         self._stop = stop
         self._capture = capture
@@ -226,7 +225,6 @@ class RecordingProgress:
     """A `RecordingObserver`; all but mismatches goes to standard error."""
 
     def __init__(self, stop: StopRequest, *, json_progress: int | None = None) -> None:
-        """Take the request to stop, and where lines for other programs go."""
         lines = JsonLines(json_progress)
         self._stop = stop
         self._bar = EpisodeBar(is_quiet=lines.is_stderr)

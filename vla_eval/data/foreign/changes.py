@@ -44,7 +44,6 @@ class Changes:
     clip_actions: bool = False
 
     def __post_init__(self) -> None:
-        """Raise `RecipeError` where a value is out of range."""
         size = self.image_size_px
         if size is not None and not 1 <= size <= MAX_IMAGE_SIZE_PX:
             raise RecipeError(f"--image-size: expected 1 to {MAX_IMAGE_SIZE_PX} px, found {size}.")

@@ -67,7 +67,6 @@ class Source:
     remarks: tuple[str, ...] = ()  # what was assumed
 
     def __post_init__(self) -> None:
-        """Check that the episodes can be one dataset."""
         first = self.episodes[0]
         for episode in self.episodes[1:]:
             differing = set(first.numbers) ^ set(episode.numbers) or {

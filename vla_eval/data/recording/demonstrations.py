@@ -83,7 +83,6 @@ class RecordedActions:
     """A policy that does again what was done."""
 
     def __init__(self, actions: FloatArray) -> None:
-        """Take (n_steps, A)."""
         self._actions = actions
         self.spec = PolicySpec(name="recorded", reads="last", cameras=(), states=(), chunk_size=1)
 

@@ -62,7 +62,6 @@ class ShardWriter:
     """Writes one shard to `path`; a context manager that leaves either the whole shard or nothing."""
 
     def __init__(self, path: Path, format: Format) -> None:
-        """Begin with an empty draft."""
         self._path = path
         remove_drafts(path)
         self._draft = draft_path(path)
@@ -91,7 +90,6 @@ class ShardWriter:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
     ) -> None:
-        """Finish the shard, or drop it after an exception."""
         if kind is not None:
             remove_drafts(self._path)
             return

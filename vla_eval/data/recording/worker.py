@@ -58,7 +58,6 @@ class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
     """Tries seeds, writes shards, and joins them; keeps the expert, too."""
 
     def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
-        """Start with nothing made."""
         super().__init__(heartbeat, tell)
         self._expert: Policy | None = None
 

@@ -19,7 +19,6 @@ class ReplayRunner(SimulatorRunner[ReplayJob, EpisodeReplayed]):
     """Replays episodes; keeps the dataset, too."""
 
     def __init__(self, heartbeat: Heartbeat, tell: Callable[[DeviceFound], None]) -> None:
-        """Start with nothing made."""
         super().__init__(heartbeat, tell)
         self._dataset: LocalDataset | None = None
 

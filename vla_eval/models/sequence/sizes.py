@@ -30,7 +30,6 @@ class RecurrentOptions:
     answers_before: bool = False
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, {"keep_bias": (-10, 10)}, prefix="")
 
 
@@ -49,7 +48,6 @@ class TransformerXLOptions:
     gated: bool = False  # GTrXL's gates instead of sums
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         counts = ("inner_width", "cached_tokens", "memory_tokens", "valve_heads")
         check_bounds(self, {**dict.fromkeys(counts, (0, MANY)), "head_width": (1, MANY)}, prefix="")
         check_bounds(self, {"attention_dropout": (0, BELOW_ONE)}, prefix="")
@@ -68,7 +66,6 @@ class MambaOptions:
     expand: int = 2  # units of a block, in widths
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         check_bounds(self, {"state": (1, MANY), "convolved": (2, MANY), "expand": (1, MANY)}, prefix="")
 
 
@@ -87,7 +84,6 @@ class ElmurOptions:
     carries_gradient: bool = True  # whether later segments teach a segment what to write
 
     def __post_init__(self) -> None:
-        """Check the ranges."""
         counts = ("slots", "experts", "inner_width", "longest")
         shares = {"attention_dropout": (0, BELOW_ONE), "memory_dropout": (0, BELOW_ONE), "blend": (0, 1)}
         check_bounds(self, {**dict.fromkeys(counts, (1, MANY)), **shares, "slot_scale": (0, MANY)}, prefix="")

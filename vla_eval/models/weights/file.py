@@ -57,11 +57,9 @@ class WeightFile(Mapping[str, Tensor]):
         return tensor
 
     def __iter__(self) -> Iterator[str]:
-        """Yield the names."""
         return iter(self._described)
 
     def __len__(self) -> int:
-        """Return the number of tensors."""
         return len(self._described)
 
     def _damaged(self, exc: Exception) -> CheckpointError:

@@ -129,7 +129,6 @@ class OneFrameOfBallPolicy(ScriptedPolicy):
     def __init__(
         self, context: PolicyContext, make_expert: BallExpertFactory, velocity_range_m_s: tuple[float, float]
     ) -> None:
-        """Take the expert of the task's family, and the (least, most) initial speed along y."""
         super().__init__(context)
         self._make_expert = make_expert
         self._rolling_m_s = ROLLING_SHARE * np.array(velocity_range_m_s)
