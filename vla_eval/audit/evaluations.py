@@ -81,10 +81,6 @@ def audit_configs(
     Tasks without a choice have no phases, so the strict rule equals the paper's for them: they are run under
     `paper` only. The episodes are per task and control, on seeds 1, 2, … or, of official tasks, on those of
     their runner. Only these controls, if given; `settings` are other fields, such as `simulator`.
-
-    Raises:
-        UnknownNameError: a task that is not in the catalogue, or a control that there is not.
-        RecipeError: no evaluation remains.
     """
     known = list(dict.fromkeys(name for names in CONTROLS.values() for name in names))
     check_names("control", controls or (), known, where="--control")

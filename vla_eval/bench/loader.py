@@ -49,10 +49,6 @@ def run_loader_bench(root: Path | None, *, n_samples: int, repeats: int) -> Load
 
     Decoded frames go to a folder that is deleted again, so that decoding is part of what is measured. Without
     a dataset a synthetic one is measured.
-
-    Raises:
-        DatasetError: there is no dataset at `root`.
-        ConformanceError: the loaders gave different samples.
     """
     with tempfile.TemporaryDirectory() as scratch:
         if root is None:

@@ -109,9 +109,6 @@ def run_official_bench(
 
     The official package, of which `python` is the environment's interpreter, has the task as `…-VLA-v0`.
     Without one, our own eager loop is the baseline.
-
-    Raises:
-        ConformanceError: a command failed.
     """
     load = os.getloadavg()[0]
     costs, horizon_steps = _costs(task)

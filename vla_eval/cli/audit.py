@@ -57,7 +57,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 def run(args: argparse.Namespace) -> int:
     """Run the controls, then print the audit to standard output; everything else goes to standard error."""
-    # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.audit.audit_text import render_audit
     from vla_eval.audit.evaluations import read_audit
     from vla_eval.cli.shared.evaluations import evaluate_each

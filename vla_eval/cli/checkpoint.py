@@ -141,7 +141,6 @@ def _look_for(args: argparse.Namespace) -> None:
 
 
 def _verify(args: argparse.Namespace) -> list[str]:
-    # Here and not above: `mikasa-vla --help` need not wait for torch.
     from vla_eval.checkpoints.loading import LoadOptions
     from vla_eval.checkpoints.verify import verify_checkpoint
     from vla_eval.policies.lerobot.device import choose_device

@@ -39,7 +39,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 def run(args: argparse.Namespace) -> int:
     """Print the comparison."""
-    # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.results.sweep import compare_runs
     from vla_eval.results.sweep_format import render_sweep, sweep_table
     from vla_eval.storage.run_folder import read_run

@@ -129,7 +129,6 @@ def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Evaluate, then print the table to standard output; everything else goes to standard error."""
-    # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.cli.shared.evaluations import evaluate_one
     from vla_eval.cli.shared.output import (
         check_baseline,

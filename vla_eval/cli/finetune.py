@@ -111,7 +111,6 @@ def run(args: argparse.Namespace) -> int:
             "fine-tuning runs on this machine; on several GPUs by `accelerate launch` (docs/finetuning.md)."
         )
     config, command = _config(args), typed_command()
-    # Here and not above: `mikasa-vla --help` need not wait for numpy.
     from vla_eval.training.request import finished_run, look_for
 
     look_for(config, is_dry=args.dry_run)

@@ -46,7 +46,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 def run(args: argparse.Namespace) -> int:
     """Merge; the new run folders or datasets go to standard output, everything else to standard error."""
-    # Here and not above, as all that follows: `mikasa-vla --help` need not wait for it.
     from vla_eval.data.recording.folder import STATE_FOLDER
 
     recordings = [path for path in args.runs if (path / STATE_FOLDER / RUN_FILE).is_file()]

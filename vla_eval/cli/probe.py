@@ -113,7 +113,6 @@ OF_GRIDS = ("probes", "delays", "cues", "first_inferences")
 
 def run(args: argparse.Namespace) -> int:
     """Run the evaluations, then print the table to standard output; everything else to standard error."""
-    # Here and not above: `mikasa-vla --help` need not wait for statistics and progress bars.
     from vla_eval.probe.interventions import plan_probe
     from vla_eval.probe.page.retention_plot import write_retention
     from vla_eval.probe.probe_text import render_probe

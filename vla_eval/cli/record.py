@@ -66,7 +66,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Record and replay; the datasets' names go to standard output, everything else to standard error."""
-    # Here and not above: `mikasa-vla --help` need not wait for lerobot.
     from vla_eval.cli.shared.output import hint_merge, hint_next
     from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
     from vla_eval.data.recording.record import record

@@ -46,7 +46,6 @@ def run(args: argparse.Namespace) -> int:
     """Replay; mismatches and summaries go to standard output, progress to standard error."""
     if args.rebuild is not None:
         return _rebuild(args)
-    # Here and not above: `mikasa-vla --help` need not wait for progress bars.
     from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
     from vla_eval.data.replaying.replay import find_datasets
 

@@ -70,7 +70,6 @@ class _ColumnNames:
 
 def run(args: argparse.Namespace) -> int:
     """Read the runs, and print their table or write their page."""
-    # Here and not above: `mikasa-vla --help` need not wait for statistics.
     from vla_eval.probe.probe_text import probe_texts
     from vla_eval.storage.run_folder import read_run
 

@@ -42,7 +42,6 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
 
 def run(args: argparse.Namespace) -> int:
     """Find the rerun files and open them."""
-    # Here and not above: `mikasa-vla --help` need not wait for them.
     from vla_eval.viz.picking import MOST_OPENED
     from vla_eval.workers.children import bound_command
 

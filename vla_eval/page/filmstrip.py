@@ -28,11 +28,7 @@ class Filmstrips:
 
 
 def write_filmstrips(runs: Sequence[StoredRun], folder: Path) -> Filmstrips:
-    """Write `TASK_POLICY_Kn.png` into a folder for each row of the table that has captured episodes.
-
-    Raises:
-        ViewingError: no episode was captured, or a file cannot be read or written.
-    """
+    """Write `TASK_POLICY_Kn.png` into a folder for each row of the table that has captured episodes."""
     where = {id(record): run.path for run in runs for record in run.records}
     files, missing = [], []
     for key, group in group_runs(runs).groups.items():

@@ -88,11 +88,6 @@ def plan_grid(config: EvalConfig, settings: GridSettings) -> Grid:
     """Return the evaluations that a grid consists of, at `DEFAULT_N_ACTION_STEPS` unless K is configured.
 
     All that the configuration names is the same everywhere but for what the settings change.
-
-    Raises:
-        UnknownNameError: a task that is not in the catalogue.
-        RecipeError: the configuration sets what the grid sets itself, a phase has no fixed length, or nothing
-            can be run.
     """
     refuse_own_arguments(config)
     if config.chunking.first_inference_step:

@@ -147,12 +147,7 @@ class Probe:
 
 
 def plan_probe(config: EvalConfig, settings: ProbeSettings) -> Probe:
-    """Return the evaluations of a probe: the configured one, in each world that the settings name.
-
-    Raises:
-        UnknownNameError: a task that is not in the catalogue.
-        RecipeError: the configuration sets what the probe sets itself, or nothing can be probed.
-    """
+    """Return the evaluations of a probe: the configured one, in each world that the settings name."""
     refuse_own_arguments(config)
     worlds: list[World] = []
     left_out: list[str] = []

@@ -70,11 +70,7 @@ class DryRunOptions:
 
 
 def describe_finetuning(config: FinetuneConfig, options: DryRunOptions) -> list[str]:
-    """Return lines for a person.
-
-    Raises:
-        VlaEvalError: a mistake in the configuration, the recipe, or a dataset that is there.
-    """
+    """Return lines for a person."""
     loaded = load_finetune_recipe(config)
     recipe = loaded.value
     out = run_folder_of(config)

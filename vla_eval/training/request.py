@@ -90,9 +90,6 @@ def look_for(config: FinetuneConfig, *, is_dry: bool = False) -> None:
     """Look for recipe, dataset and base, before torch is loaded; `training_job` looks closer.
 
     A dry run needs neither dataset nor base.
-
-    Raises:
-        VlaEvalError: one is not there, or not what is asked for.
     """
     recipe = load_finetune_recipe(config).value
     if is_dry and not os.path.isdir(config.dataset):

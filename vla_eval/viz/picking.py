@@ -23,12 +23,7 @@ class Wish:
 
 
 def pick(run: StoredRun, wish: Wish) -> list[Path]:
-    """Return the rerun files of the requested episodes, in the order of the records.
-
-    Raises:
-        UnknownNameError: no episode has such a task, policy or K.
-        ViewingError: none of the requested episodes was captured.
-    """
+    """Return the rerun files of the requested episodes, in the order of the records."""
     for name in ("task", "policy", "n_action_steps"):
         wanted = getattr(wish, name)
         known = {str(getattr(record, name)) for record in run.records}

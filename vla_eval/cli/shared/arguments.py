@@ -40,7 +40,6 @@ def typed_command() -> str:
 @contextlib.contextmanager
 def dry_run_options(args: argparse.Namespace) -> "Iterator[DryRunOptions]":
     """Give what `finetune --dry-run` assumes; where a base is missing, networks of the published sizes."""
-    # Here and not above: `mikasa-vla --help` need not wait for torch.
     from vla_eval.testing.random_checkpoint import published_sizes
     from vla_eval.training.dry_run import DryRunOptions
 

@@ -25,7 +25,6 @@ def backend_of(
     if args.cluster is None:
         yield LOCAL
         return
-    # Here and not above: `mikasa-vla --help` need not wait for it.
     from vla_eval.workers.cluster.backend import cluster
     from vla_eval.workers.cluster.connect import check_address
 

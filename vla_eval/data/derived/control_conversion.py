@@ -68,10 +68,6 @@ def convert_control_mode(
 
     Where all episodes survive with the states that were recorded, bit for bit, the images are those of the
     recording. Otherwise they are rendered again; after an interruption the same call resumes the rendering.
-
-    Raises:
-        UnknownNameError: there is no such mode.
-        DatasetError: there is no recorded dataset, or it has this mode, or no episode survives.
     """
     action_spec(mode)
     begun = time.monotonic()

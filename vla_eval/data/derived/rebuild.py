@@ -40,10 +40,6 @@ def rebuild(
 
     Returns:
         The new dataset; None if the observer asked to stop.
-
-    Raises:
-        DatasetError: there is no manifest or recipe, or the task has changed since.
-        RecordingError: the actions do not lead to the recorded states on this machine.
     """
     episodes = read_manifest(dataset)
     if not episodes:

@@ -33,10 +33,6 @@ def write_card(root: Path, *, license_id: str | None = None) -> str:
 
     The licence is named as on the Hub; by default it is that of this project for recordings and for mixtures
     of them, and none for imports.
-
-    Raises:
-        DatasetError: the dataset is not complete, or damaged.
-        StorageFullError: the disk is full.
     """
     dataset = open_dataset(root)
     (root / SHEET_FILE).parent.mkdir(exist_ok=True)

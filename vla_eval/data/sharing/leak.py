@@ -59,12 +59,7 @@ class _Start:
 
 
 def check_leak(dataset: InitialStates, *, task: str, seeds: range) -> LeakReport:
-    """Compare how the episodes of a dataset begin with the initial states of a task's evaluation seeds.
-
-    Raises:
-        UnknownNameError: there is no such task.
-        DatasetError: neither states nor first frames distinguish the evaluation's seeds from each other.
-    """
+    """Compare how the episodes of a dataset begin with the initial states of a task's evaluation seeds."""
     settings = EnvSettings(task=task_spec(task).id, simulator=dataset.simulator)
     starts = _starts(settings, _with_another(seeds))
     kind = dataset.episodes[0].kind if dataset.episodes else "eef"

@@ -50,12 +50,7 @@ class EpisodeWish:
 
 
 def write_dataset_rrds(root: Path, wish: EpisodeWish, folder: Path) -> list[Path]:
-    """Write the wished episodes as `episode_000003.rrd`, replacing files of that name; return their paths.
-
-    Raises:
-        DatasetError: there is no complete dataset.
-        ViewingError: there is no such episode, or a file cannot be written.
-    """
+    """Write the wished episodes as `episode_000003.rrd`, replacing files of that name; return their paths."""
     dataset = open_local_dataset(root)
     recorded = read_manifest(root) if (root / MANIFEST_FILE).is_file() else ()
     numbers = _wished(root, wish, int(dataset.meta.total_episodes), recorded)
