@@ -11,7 +11,7 @@ from lerobot.configs import video
 from PIL import Image
 
 from vla_eval.cli.main import main
-from vla_eval.data.recording.encoder_check import ALIASES, OF_A_DEVICE, SOFTWARE, check_encoder
+from vla_eval.data.recording.plan import ALIASES, OF_A_DEVICE, SOFTWARE, check_encoder
 from vla_eval.errors import RecipeError
 from vla_eval.features import EncoderSettings
 

@@ -6,6 +6,8 @@ vectorised environment, in which slots without an action hold still. ManiSkill i
 """
 
 import gc
+import itertools
+import math
 from collections.abc import Mapping
 from typing import Any  # ManiSkill is untyped: its environments and infos are Any here
 
@@ -15,8 +17,7 @@ import torch
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
 from vla_eval.core import FloatArray, Observation, StepResult
-from vla_eval.cue_view import CueBoxes
-from vla_eval.envs.cue_location import boxes_of_cue
+from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
 from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX
@@ -25,6 +26,7 @@ from vla_eval.tasks.appearance import with_appearance
 from vla_eval.tasks.arguments import ROBOT, check_arguments, horizon_steps, robot_uid
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
+from vla_eval.tasks.memory_env import CueSize, MemoryTableEnv, Place
 from vla_eval.tasks.register import env_class
 
 # ManiSkill collects garbage whenever it rebuilds a scene, which our tasks do at each reset. With all objects
@@ -155,3 +157,42 @@ def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs:
         sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
         **{**kwargs, ROBOT: robot, CONTROL_MODE: control_mode_of(kwargs)},
     )
+
+
+MARGIN_PX = 1  # an edge's pixel may show some of the object
+NEAR_M = 0.01  # what is nearer to the camera, or behind it, is not seen
+
+
+def boxes_of_cue(env: MemoryTableEnv, row: int, cameras: tuple[str, ...]) -> CueBoxes:
+    """Return the boxes that hold the cue of one parallel environment, in the images of these cameras."""
+    places, size = env.cue_places_m(row), env.cue_size_m()
+    found = {}
+    for name in cameras:
+        camera = env.scene.sensors[name].camera
+        # (3, 4) world to camera in OpenCV's axes (z forward), and (3, 3) camera to pixels.
+        extrinsic = camera.get_extrinsic_matrix()[row if env.gpu_sim_enabled else 0].cpu().numpy()
+        intrinsic = camera.get_intrinsic_matrix()[row if env.gpu_sim_enabled else 0].cpu().numpy()
+        edge_px = env.scene.sensors[name].config.width  # images are square
+        boxes = (_box(place, size, intrinsic @ extrinsic, edge_px=edge_px) for place in places)
+        found[name] = tuple(box for box in boxes if box is not None)
+    return found
+
+
+def _box(place: Place, size: CueSize, projection: np.ndarray[Any, Any], *, edge_px: int) -> PixelBox | None:
+    """Return the box of the eight corners; None where nothing of it is in the image."""
+    half, (x, y, z) = size.half_width_m, place
+    corners = itertools.product((x - half, x + half), (y - half, y + half), (z, z + size.height_m))
+    points = np.array([(*corner, 1.0) for corner in corners]) @ projection.T
+    points = points[points[:, 2] > NEAR_M]
+    if not len(points):
+        return None
+    columns, rows = points[:, 0] / points[:, 2], points[:, 1] / points[:, 2]
+    top, bottom = _range(rows, edge_px)
+    left, right = _range(columns, edge_px)
+    return PixelBox(top, bottom, left, right) if top < bottom and left < right else None
+
+
+def _range(values: np.ndarray[Any, Any], edge_px: int) -> tuple[int, int]:
+    """Return the first pixel and the one after the last, within the image."""
+    first, last = math.floor(values.min()) - MARGIN_PX, math.ceil(values.max()) + MARGIN_PX
+    return min(max(first, 0), edge_px), min(max(last, 0), edge_px)
