@@ -4,8 +4,8 @@ import re
 from pathlib import Path
 
 from tests.results import stored_runs
-from vla_eval.results.audit_notes import audit_notes
 from vla_eval.results.estimates import LEVEL, wilson_interval
+from vla_eval.results.report import audit_notes
 from vla_eval.results.sweep import discordance_of_independent, episodes_to_settle
 
 ROOT = Path(__file__).parents[2]

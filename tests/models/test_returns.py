@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from vla_eval.models.episodes.returns import returns_to_go, rewards_in
+from vla_eval.models.sequence.modeling_sequence import returns_to_go, rewards_in
 
 SPARSE = {
     "next.reward": torch.tensor([[1.0, 1.0, 0.0], [0.0, 1.0, 0.0]]),

@@ -10,7 +10,7 @@ from vla_eval.audit.audit_text import render_audit
 from vla_eval.audit.verdicts import verdict
 from vla_eval.errors import ReportError
 from vla_eval.results import shipped_audit as audited
-from vla_eval.results.audit_notes import audit_notes
+from vla_eval.results.report import audit_notes
 from vla_eval.results.shipped_audit import (
     NOT_AUDITED,
     OTHER_VERDICTS,

@@ -8,7 +8,7 @@ import pytest
 PROGRAM = """
 import resource
 import numpy as np
-from vla_eval.training.allocator import keep_freed_memory
+from vla_eval.training.finetune import keep_freed_memory
 
 assert keep_freed_memory()
 for _ in range(2):

@@ -10,9 +10,9 @@ import torch
 from safetensors.torch import load_file
 
 from tests.models.tiny_prompted import BASE, BOTH, OPENVLA, SPATIALVLA, WRIST, Ported
+from vla_eval.checkpoints.conversion import merge_adapter
 from vla_eval.checkpoints.files import ADAPTER_WEIGHTS_FILE, WEIGHTS_FILE
 from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint
-from vla_eval.checkpoints.merging import merge_adapter
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig

@@ -180,7 +180,7 @@ def _fetch(args: argparse.Namespace) -> list[str]:
 
 
 def _merge(args: argparse.Namespace) -> list[str]:
-    from vla_eval.checkpoints.merging import merge_adapter
+    from vla_eval.checkpoints.conversion import merge_adapter
 
     return [str(merge_adapter(Path(args.path), Path(args.out), base_checkpoint=args.base_checkpoint))]
 

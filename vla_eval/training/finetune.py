@@ -1,10 +1,12 @@
 """Fine-tune: recipe and dataset in, a run folder with checkpoints out. The same call resumes it."""
 
 import contextlib
+import ctypes
 import functools
 import hashlib
 import os
 import secrets
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +19,6 @@ from vla_eval.errors import VlaEvalError
 from vla_eval.models.shared.sentence_reading import SentenceReading, SentenceWatch
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
-from vla_eval.training.allocator import keep_freed_memory
 from vla_eval.training.cost.estimate import RateWatch, estimate
 from vla_eval.training.dataset import about_decisions, about_failures
 from vla_eval.training.extension import check_steps
@@ -242,3 +243,21 @@ def _opened(job: TrainingJob, config: FinetuneConfig, command: str) -> Iterator[
         raise
     finally:
         started.leave(failed=failed)
+
+
+# glibc's malloc.h
+M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4
+NEVER_BYTES = (1 << 31) - 1
+
+
+def keep_freed_memory() -> bool:
+    """Let malloc keep large blocks and free memory in the process; return whether it does.
+
+    Without glibc (macOS, musl) nothing is changed. No result depends on it.
+    """
+    if not sys.platform.startswith("linux"):
+        return False
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "gnu_get_libc_version"):
+        return False
+    return bool(libc.mallopt(M_MMAP_MAX, 0)) and bool(libc.mallopt(M_TRIM_THRESHOLD, NEVER_BYTES))
