@@ -102,16 +102,16 @@ def run(
     first_inference_step: int = 0,
     log: ActionLog | None = None,
     env: SimEnv | None = None,
+    horizon_steps: int | None = None,
 ) -> list[EpisodeRecord]:
     env = privileged_env(task) if env is None else env
     policy = make_policy(policy_name, env, n_action_steps)
     chunking = ChunkingSpec(n_action_steps=n_action_steps, first_inference_step=first_inference_step)
     settings = RolloutSettings(chunking=chunking)
+    horizon = horizon_steps or env.spec.horizon_steps
     records = []
     for seed in seeds:
-        start = EpisodeStart(
-            slot=0, task=task, seed=seed, run=0, instruction="go", horizon_steps=env.spec.horizon_steps
-        )
+        start = EpisodeStart(slot=0, task=task, seed=seed, run=0, instruction="go", horizon_steps=horizon)
         records += rollout(env, policy, [start], settings, observers=[log] if log else [])
     return records
 
@@ -149,7 +149,7 @@ def test_oracle_reaches_its_promised_success_on_the_evaluation_seeds(task: str) 
 def test_experts_hold_still_until_the_choice_can_be_made(policy: str, n_action_steps: int) -> None:
     for task in ("RememberColor3-v0", "ChainOfColors3-v0", "ShellGameTouch-v0"):
         log = ActionLog()
-        run(task, policy, [3], n_action_steps=n_action_steps, log=log)
+        run(task, policy, [3], n_action_steps=n_action_steps, log=log, horizon_steps=40)
         response_step = next(r.observation.step for r in log.results if r.status.phase == "response")
         before = np.stack(log.actions[:response_step])
         assert np.array_equal(before[:, :6], np.zeros((response_step, 6)))

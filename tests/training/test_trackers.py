@@ -10,9 +10,6 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
-import wandb
-from wandb.proto import wandb_internal_pb2
-from wandb.sdk.internal.datastore import DataStore
 
 from tests.training import test_held_out, tiny_trainings
 from tests.training.test_held_out import ON_FAKE, same_weights
@@ -62,6 +59,8 @@ class Fake:
         def init(**_: Any) -> Any:
             self.call("begin")
             return run
+
+        import wandb  # here: it takes seconds, and each test process imports this module
 
         module: Any = ModuleType("wandb")
         module.init, module.errors, module.teardown = init, wandb.errors, lambda: None
@@ -172,6 +171,8 @@ def no_account(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
     monkeypatch.chdir(tmp_path)
     for name in ("WANDB_API_KEY", "WANDB_MODE", "WANDB_DIR", "NETRC"):
         monkeypatch.delenv(name, raising=False)
+    import wandb
+
     wandb.teardown()
     yield
     wandb.teardown()
@@ -199,6 +200,9 @@ def offline_runs(run: Path) -> list[Path]:
 
 
 def logged_steps(folder: Path) -> list[int]:
+    from wandb.proto import wandb_internal_pb2
+    from wandb.sdk.internal.datastore import DataStore
+
     store, steps = DataStore(), []
     store.open_for_scan(str(next(folder.glob("*.wandb"))))
     while (data := store.scan_data()) is not None:
