@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from vla_eval.envs.official_episode import OfficialEpisode
+from vla_eval.envs.official import OfficialEpisode
 from vla_eval.envs.official_state import read_bodies, read_candidates
 from vla_eval.errors import SpecMismatchError
 from vla_eval.tasks.catalog import SUITES, task_spec

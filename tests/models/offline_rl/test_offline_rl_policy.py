@@ -12,9 +12,8 @@ from vla_eval.config.files import load_recipe, to_data
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError, UnknownNameError
 from vla_eval.models.offline_rl.configuration_offline_rl import ALGORITHMS, MikasaOfflineRLConfig
-from vla_eval.models.offline_rl.modeling_offline_rl import MikasaOfflineRLPolicy
+from vla_eval.models.offline_rl.modeling_offline_rl import OBJECTIVES, MikasaOfflineRLPolicy
 from vla_eval.models.offline_rl.network import OfflineRLNetwork
-from vla_eval.models.offline_rl.objectives import OBJECTIVES
 
 IMAGE_PX = 36  # the smallest that the encoder's three convolutions leave one place of
 BASE, WRIST = "observation.images.base", "observation.images.wrist"
