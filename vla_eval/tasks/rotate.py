@@ -14,7 +14,7 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.task_state import TaskStatus
 from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
-from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive, check_range
+from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
 
 PEG_RANGE_M = 0.1  # the peg's centre is within ± this in x and y
 PEG_RGBA = (12 / 255, 42 / 255, 160 / 255, 1.0)
@@ -80,9 +80,7 @@ class RotateEnv(WithoutCueEnv):
         ):
             if limit is not None:
                 check_positive(**{name: limit})
-        self.angle_range_rad = check_range(
-            "angle_range_rad", angle_range_rad, least=angle_threshold_rad, unit="rad"
-        )
+        self.angle_range_rad = _in_order(angle_range_rad, least_rad=angle_threshold_rad)
         if self.angle_range_rad[1] > math.pi:
             raise TaskArgumentError(f"angle_range_rad={angle_range_rad!r}: expected at most π.")
         if official_signs and not signed:
@@ -230,3 +228,16 @@ class RotateEnv(WithoutCueEnv):
 
     def _privileged_extra(self) -> dict[str, torch.Tensor]:
         return {"oracle_info": self.oracle_info(), "peg_pose": self.peg.pose.raw_pose}
+
+
+def _in_order(value: Any, *, least_rad: float) -> tuple[float, float]:
+    """Return (least, most), or raise `TaskArgumentError`."""
+    try:
+        low, high = (float(number) for number in value)
+    except (TypeError, ValueError):
+        low, high = 1.0, 0.0
+    if not least_rad <= low <= high:
+        raise TaskArgumentError(
+            f"angle_range_rad={value!r}: expected (least, most) in rad with {least_rad:g} ≤ least ≤ most."
+        )
+    return low, high

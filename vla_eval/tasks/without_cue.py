@@ -32,26 +32,3 @@ def check_positive(**numbers: float) -> None:
     for name, number in numbers.items():
         if isinstance(number, bool) or not isinstance(number, int | float) or not number > 0:
             raise TaskArgumentError(f"{name}={number!r}: expected a number > 0.")
-
-
-def check_range(name: str, value: Any, *, least: float, unit: str) -> tuple[float, float]:
-    """Return (least, most) of a pair of numbers.
-
-    Args:
-        name: of the argument.
-        value: what was given for it.
-        least: the pair must be greater than this, or equal.
-        unit: for the message.
-
-    Raises:
-        TaskArgumentError: no pair of numbers in order, or below `least`.
-    """
-    try:
-        low, high = (float(number) for number in value)
-    except (TypeError, ValueError):
-        low, high = 1.0, 0.0
-    if not least <= low <= high:
-        raise TaskArgumentError(
-            f"{name}={value!r}: expected (least, most) in {unit} with {least:g} ≤ least ≤ most."
-        )
-    return low, high

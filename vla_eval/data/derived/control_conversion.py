@@ -41,8 +41,6 @@ from vla_eval.errors import DatasetError
 from vla_eval.oracles.translation import command, joint_target
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.specs import PolicySpec
-from vla_eval.workers.backend import Backend
-from vla_eval.workers.local import LOCAL
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +60,6 @@ def convert_control_mode(
     out: Path,
     observer: RecordingObserver,
     workers: int | Literal["auto"] = "auto",
-    backend: Backend = LOCAL,
 ) -> Converted | None:
     """Write OUT/TASK with the episodes of a recorded dataset in another control mode; None if asked to stop.
 
@@ -105,7 +102,6 @@ def convert_control_mode(
                 )
             },
             source=manifest_sha256(dataset),
-            backend=backend,
         )
         if summary.was_stopped:
             return None

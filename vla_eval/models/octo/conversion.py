@@ -37,8 +37,7 @@ def octo_config(fields: dict[str, Any]) -> MikasaOctoConfig:
         config = MikasaOctoConfig(device="cpu", push_to_hub=False, **fields)
     except (TypeError, ValueError) as exc:
         raise CheckpointError(f"not a configuration of Octo: {exc}.") from exc
-    made: MikasaOctoConfig = with_features(config, dict.fromkeys(config.cameras.values(), (height, width)))
-    return made
+    return with_features(config, dict.fromkeys(config.cameras.values(), (height, width)))
 
 
 def _with_shared(policy: Any, weights: dict[str, Tensor]) -> dict[str, Tensor]:

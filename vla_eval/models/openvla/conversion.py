@@ -153,8 +153,7 @@ def _config(source: Path, options: OpenVLAOptions) -> MikasaOpenVLAConfig:
         push_to_hub=False,
     )
     cameras = dict.fromkeys(options.pictures, (options.camera_px, options.camera_px))
-    made: MikasaOpenVLAConfig = with_features(config, cameras, state=options.proprio)
-    return made
+    return with_features(config, cameras, state=options.proprio)
 
 
 def _pickled(source: Path, name: str, *, allowed: bool) -> dict[str, Tensor]:

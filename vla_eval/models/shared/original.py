@@ -36,15 +36,16 @@ class Original:
     check_tokenizer: Callable[[Any], None] | None = None
 
 
-def with_features(config: Any, cameras: Mapping[str, tuple[int, int]], *, state: int = 0) -> Any:
+def with_features[C](config: C, cameras: Mapping[str, tuple[int, int]], *, state: int = 0) -> C:
     """Return a configuration with our datasets' fields: cameras' (height_px, width_px), `state` numbers."""
     fields = {
         name: PolicyFeature(type=FeatureType.VISUAL, shape=(3, *size)) for name, size in cameras.items()
     }
     if state:
         fields[STATE_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(state,))
-    config.input_features = fields
-    config.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
+    made: Any = config  # lerobot, whose fields it has, is untyped
+    made.input_features = fields
+    made.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
     return config
 
 

@@ -83,34 +83,31 @@ class MikasaSpatialVLAConfig(PromptedConfig):
     """SpatialVLA.
 
     Attributes:
-        chunk_size: actions of a chunk, three tokens each.
-        pictures: the base camera alone, as the original does; with the wrist's it is an extension of ours.
-        camera_fov_rad: vertical field of view of their cameras, from which their matrices are made. MIKASA's
-            cameras have a quarter turn; an evaluation with others is refused.
-        action_grid: where a fine-tuning has the bins: `refitted` to the dataset's actions (tokens of a base
-            are moved along), `kept` as the base has them, `uniform`.
-        grid: edges of the bins, axis by axis (`action_grid.AXES`); set by a fine-tuning or a conversion.
-        base_grid: those of the base, if they were others; set by a fine-tuning.
-        prefix_attention: what images and prompt attend to, see `sizes.Attention`.
-        inference_attention: the same for inference; None becomes that of training. A converted checkpoint has
-            `bidirectional`, because the original predicts so, though its scripts train with `causal`. What is
-            fine-tuned here predicts as it was trained, whatever its base does.
-        train_spatial_embeddings: train the embeddings of the action tokens.
-        train_word_embeddings: train Gemma's own embeddings, and the matrix that predicts tokens.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps: AdamW, and
             `mikasa_linear_decay`.
     """
 
-    chunk_size: int = 4
+    chunk_size: int = 4  # actions of a chunk, three tokens each
     n_action_steps: int = 4
+    # the base camera alone, as the original does; with the wrist's it is an extension of ours
     pictures: list[str] = field(default_factory=lambda: [CAMERA_KEYS["base_camera"]])
+    # vertical field of view of their cameras, from which their matrices are made. MIKASA's cameras have
+    # a quarter turn; an evaluation with others is refused.
     camera_fov_rad: float = math.pi / 2
+    # where a fine-tuning has the bins: `refitted` to the dataset's actions (tokens of a base are moved
+    # along), `kept` as the base has them, `uniform`
     action_grid: str = "refitted"
+    # edges of the bins, axis by axis (`action_grid.AXES`); set by a fine-tuning or a conversion
     grid: list[list[float]] = field(default_factory=list)
+    # those of the base, if they were others; set by a fine-tuning
     base_grid: list[list[float]] = field(default_factory=list)
-    prefix_attention: str = "causal"
+    prefix_attention: str = "causal"  # what images and prompt attend to, see `sizes.Attention`
+    # the same for inference; None becomes that of training. A converted checkpoint has `bidirectional`,
+    # because the original predicts so, though its scripts train with `causal`. What is fine-tuned here
+    # predicts as it was trained, whatever its base does.
     inference_attention: str | None = None
-    train_spatial_embeddings: bool = False
+    train_spatial_embeddings: bool = False  # train the embeddings of the action tokens
+    # train Gemma's own embeddings, and the matrix that predicts tokens
     train_word_embeddings: bool = False
     gripper: str = "unit_open"
     do_mask_loss_for_padding: bool = True

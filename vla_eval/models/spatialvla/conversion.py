@@ -125,8 +125,7 @@ def _config(
         push_to_hub=False,
     )
     cameras = dict.fromkeys(options.cameras, (options.camera_px, options.camera_px))
-    made: MikasaSpatialVLAConfig = with_features(config, cameras)
-    return made
+    return with_features(config, cameras)
 
 
 def _check_tokenizer(source: Path, tokenizer: Any, sizes: NetworkSizes) -> None:
