@@ -1,6 +1,7 @@
 """A dry run of an evaluation counts what is left, and changes nothing."""
 
 import dataclasses
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -108,10 +109,22 @@ def test_the_command_prints_what_would_run(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_that_was_killed_before_its_first_episode_has_all_of_them_to_run(tmp_path: Path) -> None:
-    evaluate(config(), out=tmp_path / "run")
-    (tmp_path / "run" / "episodes.jsonl").unlink()
-    effort = evaluation_effort(config(), out=tmp_path / "run")
+@pytest.fixture(scope="module")
+def _whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("whole") / "run"
+    evaluate(config(), out=out)
+    return out
+
+
+@pytest.fixture
+def whole(_whole: Path, tmp_path: Path) -> Path:
+    """Return a copy of the folder of a finished run."""
+    return Path(shutil.copytree(_whole, tmp_path / "run"))
+
+
+def test_a_run_that_was_killed_before_its_first_episode_has_all_of_them_to_run(whole: Path) -> None:
+    (whole / "episodes.jsonl").unlink()
+    effort = evaluation_effort(config(), out=whole)
     assert (effort.n_episodes, effort.n_finished) == (8, 0)
 
 
@@ -127,37 +140,35 @@ class TestRefusals:
     )
 
     @pytest.mark.parametrize("changes", CHANGES, ids=lambda changes: next(iter(changes)))
-    def test_a_folder_of_another_configuration(self, tmp_path: Path, changes: dict[str, Any]) -> None:
-        evaluate(config(), out=tmp_path / "run")
+    def test_a_folder_of_another_configuration(self, whole: Path, changes: dict[str, Any]) -> None:
         other = dataclasses.replace(config(), **changes)
-        assert _refused(other, tmp_path / "run") == _refused(other, tmp_path / "run", dry=False)
+        assert _refused(other, whole) == _refused(other, whole, dry=False)
 
-    @pytest.mark.parametrize(
-        "content", ["file", "other files", "episodes alone", "damaged", "a line too many"]
-    )
+    @pytest.mark.parametrize("content", ["file", "other files", "episodes alone"])
     def test_a_folder_that_no_run_can_go_into(self, tmp_path: Path, content: str) -> None:
         out = tmp_path / "run"
         if content == "file":
             out.write_text("")
-        elif content in ("other files", "episodes alone"):
+        else:
             out.mkdir()
             (out / ("notes.txt" if content == "other files" else "episodes.jsonl")).write_text("")
-        else:
-            evaluate(config(), out=out)
-            if content == "damaged":
-                (out / "run.json").write_text("{")
-            else:
-                lines = (out / "episodes.jsonl").read_text()
-                (out / "episodes.jsonl").write_text(lines + lines.splitlines()[0] + "\n")
         assert _refused(config(), out) == _refused(config(), out, dry=False)
 
+    @pytest.mark.parametrize("is_damaged", [True, False])
+    def test_a_folder_that_is_damaged_or_has_a_line_too_many(self, whole: Path, is_damaged: bool) -> None:
+        if is_damaged:
+            (whole / "run.json").write_text("{")
+        else:
+            lines = (whole / "episodes.jsonl").read_text()
+            (whole / "episodes.jsonl").write_text(lines + lines.splitlines()[0] + "\n")
+        assert _refused(config(), whole) == _refused(config(), whole, dry=False)
+
     def test_another_environment_unless_it_is_allowed(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+        self, whole: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        evaluate(config(), out=tmp_path / "run")
         monkeypatch.setattr(evaluating, "collect_environment", lambda: {"python": "another"})
-        assert _refused(config(), tmp_path / "run") == _refused(config(), tmp_path / "run", dry=False)
-        effort = evaluation_effort(config(), out=tmp_path / "run", allow_environment_change=True)
+        assert _refused(config(), whole) == _refused(config(), whole, dry=False)
+        effort = evaluation_effort(config(), out=whole, allow_environment_change=True)
         assert effort.n_finished == 8
 
 

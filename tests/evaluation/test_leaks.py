@@ -114,7 +114,11 @@ def results(bench: Bench, out: str, policies: list[str]) -> list[str]:
 
 @pytest.mark.parametrize(
     ("workers", "victims_first"),
-    [(2, False), (1, True), pytest.param(1, False, marks=pytest.mark.slow)],
+    [
+        (1, True),
+        pytest.param(2, False, marks=pytest.mark.slow),
+        pytest.param(1, False, marks=pytest.mark.slow),
+    ],
 )
 def test_thirty_kinds_of_leak_change_no_other_policy_s_records(
     bench: Bench, workers: int, victims_first: bool
