@@ -117,7 +117,11 @@ def test_as_much_is_hidden_elsewhere_and_later_as_of_the_cue() -> None:
 
 
 @pytest.mark.parametrize(
-    "task", ["RememberColor3-v0", "ShellGameTouch-v0", "BunchOfColors3-v0", "ChainOfColors3-v0"]
+    "task",
+    [
+        *("RememberColor3-v0", "ChainOfColors3-v0"),
+        *(pytest.param(task, marks=pytest.mark.slow) for task in ("ShellGameTouch-v0", "BunchOfColors3-v0")),
+    ],
 )
 def test_a_late_cue_is_the_usual_one_after_steps_without_it(task: str) -> None:
     n_cue = 3 if task.startswith("Chain") else 1
