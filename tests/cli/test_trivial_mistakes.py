@@ -11,6 +11,13 @@ from tests.cli.every_verb import COMMANDS, environment_of, verb_of
 
 TASK = "RememberColor3-v0"
 FAKE = "--set simulator=fake"
+# What a task's arguments cannot be together; of those a typo, a wrong type, and an end before the choice.
+WRONG_ENV = {
+    "--set env.delay_step=20": "Did you mean 'delay_steps'?",
+    "--set env.delay_steps=long": "delay_steps",
+    "--set env.horizon_steps=8": "no step is left for the choice",
+    "--set env.control_mode=pd_ee": "Did you mean 'pd_ee_",
+}
 HEAVY = (*("torch", "lerobot", "transformers", "datasets", "mani_skill", "sapien", "cv2", "rerun"),)
 MOST_CPU_SECONDS = 2.0
 # Verb -> command lines, each with a word that the message must have.
@@ -23,6 +30,10 @@ MISTAKES: dict[str, dict[str, str]] = {
         f"eval --task {TASK} --policy runs/nowhere {FAKE}": "runs/nowhere",
         f"eval --task {TASK} --policy empty {FAKE}": "empty",
         f"eval --task {TASK} --policy oracle --protocol paper_vl {FAKE}": "Did you mean 'paper_vla'",
+        f"eval --task {TASK} --policy smolvla {FAKE}": "mikasa-vla checkpoint fetch smolvla_base",
+        f"eval --task {TASK} --policy act --dry-run": "has no weights",
+        f"eval --task {TASK} --policy memory_color3 --n-action-steps 4 16 --dry-run": "chunks of 8 actions",
+        **{f"eval --task {TASK} --policy oracle --dry-run {env}": said for env, said in WRONG_ENV.items()},
     },
     "report": {"report runs/nowhere": "runs/nowhere", "report empty": "empty"},
     "merge": {"merge runs/nowhere --out new": "runs/nowhere"},
@@ -32,21 +43,26 @@ MISTAKES: dict[str, dict[str, str]] = {
         "check runs/nowhere": "runs/nowhere",
         "check empty": "empty",
         "check oracle --task RememberColour3-v0": "RememberColour3-v0",
+        "check smolvla": "has no weights",
     },
     "audit": {
         f"audit --task RememberColour3-v0 {FAKE}": "RememberColour3-v0",
         f"audit --task {TASK} --control hodl {FAKE}": "hodl",
+        f"audit --task {TASK} --set env.delay_step=20": "an audit sets this field itself",
     },
     "probe": {
         f"probe --task RememberColour3-v0 --policy oracle {FAKE}": "RememberColour3-v0",
         f"probe --task {TASK} --policy orcale {FAKE}": "Did you mean 'oracle'",
         f"probe --task {TASK} --policy runs/nowhere {FAKE}": "runs/nowhere",
         "probe nowhere": "nowhere",
+        f"probe --task {TASK} --policy act {FAKE}": "has no weights",
+        **{f"probe --task {TASK} --policy oracle {env}": said for env, said in WRONG_ENV.items()},
     },
     "view": {"view runs/nowhere --print": "runs/nowhere", "view empty --print": "empty"},
     "record": {
         "record nowhere": "nowhere",
         f"record --task RememberColour3-v0 {FAKE}": "RememberColour3-v0",
+        **{f"record --task {TASK} {env}": said for env, said in WRONG_ENV.items()},
     },
     "replay": {"replay data/nowhere": "data/nowhere", "replay empty": "empty"},
     "dataset": {

@@ -66,7 +66,7 @@ def test_frames_of_a_policy_behind_a_socket_are_those_that_its_server_wants(
     said: dict[str, Any], fields: dict[str, Any], expected: int
 ) -> None:
     camera = {"base_camera": {"key": "image", "height_px": 128, "width_px": 128}}
-    with serving(SmallServer(**{"cameras": camera, **said})) as url:
+    with serving(SmallServer(**{"cameras": camera, "chunk_size": 6, **said})) as url:
         served = dataclasses.replace(config(), policies=(url,), n_action_steps=(6,), episodes=1, **fields)
         assert evaluation_effort(served, out=Path("nowhere")).n_frames == 2 * expected
 

@@ -27,6 +27,7 @@ from tests.checkpoints.small_checkpoints import (
 )
 from tests.training.lerobot_tiny import TINY, Tiny, lerobots_types
 from vla_eval.checkpoints.loading import LoadOptions, make_empty_policy
+from vla_eval.checkpoints.notes import known_chunk_size
 from vla_eval.checkpoints.verify import verify_checkpoint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.finetuning import FinetuneConfig
@@ -116,6 +117,7 @@ def evaluated(folder: Path) -> str:
     """Return which K an evaluation may have, of 1 and the longest chunk."""
     policy = loaded(folder)
     longest = policy.spec.chunk_size
+    assert known_chunk_size("lerobot", {"checkpoint": str(folder)}, recipe=folder.name) in (None, longest)
     for n_action_steps in {1, longest}:
         settings = RolloutSettings(chunking=ChunkingSpec(n_action_steps=n_action_steps))
         (record,) = rollout(make_env(FAKE), policy, [start()], settings)

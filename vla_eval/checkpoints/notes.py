@@ -7,21 +7,26 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any  # JSON of another program
 
+from vla_eval.checkpoints.bases import no_weights
+from vla_eval.checkpoints.config_check import MAX_ACTIONS
 from vla_eval.checkpoints.files import (
+    CONFIG_FILE,
     POSTPROCESSOR_FILE,
     PREPROCESSOR_FILE,
     TrainingFacts,
     checkpoint_sha256,
     find_checkpoint,
     read_facts,
+    read_json,
     unreadable,
 )
+from vla_eval.checkpoints.policy_types import asked_for_steps
 from vla_eval.checkpoints.saved_processor import SavedStep, read_saved_processor
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.models.families import FAMILIES
 from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 from vla_eval.seeding import SeedRange
-from vla_eval.strict.json_fields import get_mapping, get_text
+from vla_eval.strict.json_fields import get_count, get_mapping, get_text
 
 LEROBOT_ADAPTER = "lerobot"
 LEROBOT_CHECKPOINTS = frozenset(
@@ -47,6 +52,24 @@ def checkpoint_folder(adapter: str, args: Mapping[str, Any]) -> Path | None:
     if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
         return None
     return find_checkpoint(Path(checkpoint))
+
+
+def known_chunk_size(adapter: str, args: Mapping[str, Any], *, recipe: str) -> int | None:
+    """Return how many actions a policy predicts at once; None where only the loaded policy knows that.
+
+    Raises:
+        CheckpointError: a policy that is trained has no weights.
+    """
+    if adapter in LEROBOT_CHECKPOINTS and args.get("checkpoint") is None:
+        raise no_weights(recipe)
+    folder = checkpoint_folder(adapter, args)
+    if folder is None:
+        return None
+    where = str(folder / CONFIG_FILE)
+    data = read_json(folder / CONFIG_FILE)
+    if asked_for_steps(get_text(data, "type", where=where)):
+        return 1
+    return get_count(data, "chunk_size", maximum=MAX_ACTIONS, where=where)
 
 
 def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:

@@ -12,6 +12,7 @@ from typing import Any
 from vla_eval.checkpoints.execution_fields import ignored_fields
 from vla_eval.checkpoints.notes import (
     checkpoint_hashes,
+    known_chunk_size,
     normalization_notes,
     training_seeds,
     training_sentences,
@@ -103,7 +104,8 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
             shards than blocks of episodes that stay together.
         MissingInstructionError: a task has no instruction in the prompt set.
         TaskArgumentError: see `describe_env`.
-        CheckpointError: the weights that a recipe names are not there, or not whole.
+        CheckpointError: the weights that a recipe names are not there, or not whole; or it has none yet.
+        SpecMismatchError: a checkpoint or a server predicts shorter chunks than are to be executed.
     """
     config, policies = resolved.config, resolved.policies
     _refuse_instruction(config)
@@ -336,16 +338,21 @@ def _groups(
     steps = config.n_action_steps or (policy.value.default_n_action_steps,)
     for n_action_steps, (index, recipe) in product(steps, enumerate(policy.recipes)):
         args = recipe.value.args
+        chunking = config.chunking.at(n_action_steps)
+        chunk_size = known_chunk_size(recipe.value.adapter, args, recipe=recipe.name)
         if server is not None:
+            chunk_size = server.chunk_size
             args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare
             n_rows = server.batch_max or n_rows
+        if chunk_size is not None:
+            chunking.check_chunk_size(chunk_size, policy=policy.name)
         yield EpisodeGroup(
             key=GroupKey(task.id, policy.name, n_action_steps),
             adapter=recipe.value.adapter,
             args=args,
             env=_env_settings(config, task),
             rollout=RolloutSettings(
-                chunking=config.chunking.at(n_action_steps),
+                chunking=chunking,
                 eager_rendering=config.eager_rendering,
                 stop_at_success=config.stop_at_success,
                 reset_policy_at_step=config.reset_policy_at_step,

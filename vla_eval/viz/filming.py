@@ -43,7 +43,7 @@ def film_again(
 
 
 def _is_same(first: StepResult, second: StepResult) -> bool:
-    """Whether two results are equal to the bit, but for images and what privileged policies are told."""
+    """Whether two results are equal to the bit, but for images and the true state of the world."""
     states, others = first.observation.state, second.observation.state
     return (
         (first.status, first.reward, first.wording) == (second.status, second.reward, second.wording)

@@ -31,7 +31,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vla_eval.checkpoints.bases import first_fetch
+from vla_eval.checkpoints.bases import no_weights
 from vla_eval.checkpoints.files import read_facts
 from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.checkpoints.plain_errors import plain_errors
@@ -44,7 +44,7 @@ from vla_eval.checkpoints.policy_types import (
 from vla_eval.checkpoints.select_step import select_step
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
-from vla_eval.errors import CheckpointError, InvalidActionError, SpecMismatchError
+from vla_eval.errors import InvalidActionError, SpecMismatchError
 from vla_eval.features import CAMERA_KEYS, PROPRIO_STATES, StateKind
 from vla_eval.models.episodes.memory import (
     memory_of,
@@ -272,12 +272,7 @@ def make_lerobot(
 ) -> LeRobotPolicy:
     """Make a policy from a LeRobot checkpoint; `docs/lerobot_policies.md` explains the arguments."""
     if checkpoint is None:
-        raise CheckpointError(
-            f"policy '{context.name}' has no weights: its recipe says how to fine-tune it."
-            f"{first_fetch(context.name)} Run `mikasa-vla finetune --policy {context.name} --dataset DIR "
-            "--out RUN`, then `mikasa-vla eval --policy RUN`; or name a folder with `checkpoint` in the "
-            "recipe's args."
-        )
+        raise no_weights(context.name)
     options = LoadOptions(
         device=choose_device(device), dtype=dtype, tokenizer=tokenizer, base_checkpoint=base_checkpoint
     )
