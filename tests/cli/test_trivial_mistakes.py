@@ -25,6 +25,10 @@ MISTAKES: dict[str, dict[str, str]] = {
     "init": {"init own": "ends in .yaml", "init nowhere/own.yaml": "no folder 'nowhere'"},
     "eval": {
         "eval nowhere": "nowhere",
+        "eval nowhere.yaml": "nowhere.yaml: there is no such file or folder in ",
+        f"eval --task {TASK} --policy mine= {FAKE}": "found empty text",
+        f"eval --task {TASK} --policy mine=empty,,empty {FAKE}": "found empty text",
+        f"eval --task {TASK} --policy mine:{TASK}= {FAKE}": "found empty text",
         f"eval --task RememberColour3-v0 --policy oracle {FAKE}": "RememberColour3-v0",
         f"eval --task {TASK} --policy orcale {FAKE}": "Did you mean 'oracle'",
         f"eval --task {TASK} --policy runs/nowhere {FAKE}": "runs/nowhere",

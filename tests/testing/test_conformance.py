@@ -267,3 +267,18 @@ def test_a_policy_that_knows_one_sentence_is_checked_with_it_and_that_is_said() 
     assert any(line.startswith("Not tried: episodes with different sentences") for line in met)
     with pytest.raises(ConformanceError, match="Keep your state"):
         check_policy(lambda: KnowsOne("bright", "the first", is_shared=True), env)
+
+
+class Raising(OneBit):
+    """Raises an exception in its second inference."""
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        if len(self._seen[window.slot]) == 1:
+            raise KeyError("camera")
+        return super().act(window)
+
+
+def test_an_exception_of_the_policy_is_one_message_with_line_step_and_seed() -> None:
+    pattern = r"`act` raised KeyError: 'camera' \(test_conformance.py, line \d+\), at step 4 of seed 0\."
+    with pytest.raises(ConformanceError, match=pattern):
+        check_policy(lambda: Raising("bright", "the first", is_shared=False, chunk_size=4), _small_env())

@@ -62,6 +62,7 @@ def known_chunk_size(adapter: str, args: Mapping[str, Any], *, recipe: str) -> i
     """
     if adapter in LEROBOT_CHECKPOINTS and args.get("checkpoint") is None:
         raise no_weights(recipe)
+    _check_names(adapter, args, policy=recipe)
     folder = checkpoint_folder(adapter, args)
     if folder is None:
         return None
@@ -83,11 +84,7 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
         CheckpointError: the weights are not there.
         RecipeError: an argument that names a folder is not text.
     """
-    for name in ("checkpoint", "base_checkpoint"):
-        if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):
-            raise RecipeError(
-                f"policy '{policy}': args.{name} is {args[name]!r:.80}, expected the path of a folder."
-            )
+    _check_names(adapter, args, policy=policy)
     folder = checkpoint_folder(adapter, args)
     if folder is None:
         return {}
@@ -186,3 +183,11 @@ def _numbers(file: Path) -> dict[str, list[float]]:
     except Exception as exc:  # safetensors raises a class of its own that is not public
         raise unreadable(file, exc) from exc
     return {name: [float(value) for value in values.reshape(-1)] for name, values in tensors.items()}
+
+
+def _check_names(adapter: str, args: Mapping[str, Any], *, policy: str) -> None:
+    for name in ("checkpoint", "base_checkpoint"):
+        if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):
+            raise RecipeError(
+                f"policy '{policy}': args.{name} is {args[name]!r:.80}, expected the path of a folder."
+            )

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 from vla_eval.config.shipped import search_folders
-from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, unknown_name
+from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, did_you_mean, unknown_name
 from vla_eval.records import is_name
 from vla_eval.strict.bounds import require
 from vla_eval.strict.decoding import decode, set_field
@@ -78,7 +78,7 @@ def find_recipe(folder: Folder, name: str) -> Path:
     stem = name.removeprefix(f"{folder}/").removesuffix(".yaml")
     if stem in known:
         return known[stem]
-    if "/" in stem:
+    if "/" in stem or (as_path.suffix in (".yaml", ".yml") and not did_you_mean(stem, known)):
         raise UnknownNameError(
             f"{name:.{MAX_SHOWN}}: there is no such file or folder in {Path.cwd()}. Expected the path "
             f"of one, or a name of `mikasa-vla list {folder}`."

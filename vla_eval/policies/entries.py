@@ -4,6 +4,7 @@
 `NAME:TASK=A,B,C` are those for one task; such entries of one name are one policy with a checkpoint per task.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -57,6 +58,7 @@ def load_policy_entry(text: str) -> PolicyEntry:
         UnknownNameError: there is no such policy, or no such task.
     """
     named = named_checkpoints(text)
+    _refuse_empty(text)
     if named is None:
         return _single(text)
     for one in named.checkpoints:
@@ -90,6 +92,16 @@ def _single(text: str) -> PolicyEntry:
     is_remote = recipe.value.adapter == REMOTE_ADAPTER
     said = survey(recipe.value.args, policy=recipe.name) if is_remote else None
     return PolicyEntry(name=recipe.name, recipes=(recipe,), texts=(text,), server=said)
+
+
+def _refuse_empty(text: str) -> None:
+    """Raise `RecipeError` for `NAME=` and `NAME=A,,B`, as of a shell variable that is not set."""
+    name, equals, folders = text.partition("=")
+    if equals and not all(folders.split(",")) and not os.path.exists(text):
+        raise RecipeError(
+            f"policies: {text}: expected a folder with a checkpoint after '{name}=', found empty text. If a "
+            'shell variable stands there, it is not set, or empty: `echo "$NAME"` shows it.'
+        )
 
 
 def _is_served(text: str, one: str) -> RecipeError:

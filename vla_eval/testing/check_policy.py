@@ -1,6 +1,7 @@
 """Does a policy fulfil the contract of `Policy`?"""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,10 +15,11 @@ from vla_eval.core import (
     ObservationWindow,
     Policy,
 )
-from vla_eval.errors import ConformanceError
+from vla_eval.errors import ConformanceError, VlaEvalError
 from vla_eval.specs import EnvSpec, PolicySpec, check_compatible
 from vla_eval.testing.claims import claim
 from vla_eval.wire.noise import PAIRS, ROWS, SEEDS, look_at, n_inferences, noise_image, noise_state
+from vla_eval.workers.messages import own_line
 
 HORIZON_STEPS = 60
 
@@ -107,6 +109,25 @@ def _check_independence(
     met.same(runs.run(policy, *meanwhile), "when another episode begins or ends meanwhile", BY_SLOT)
 
 
+class _PolicyError(ConformanceError):
+    """The policy itself raised an exception."""
+
+
+@contextmanager
+def _named(method: str, episodes: Sequence[_Episode], *, chunk_size: int) -> Iterator[None]:
+    """Say of an exception of the policy where its code was, and in which episode and step."""
+    try:
+        yield
+    except VlaEvalError:
+        raise
+    except Exception as exc:
+        where = ", ".join(f"step {len(one.chunks) * chunk_size} of seed {one.seed}" for one in episodes)
+        line = own_line(exc)
+        raise _PolicyError(
+            f"`{method}` raised {type(exc).__name__}: {exc}{f' ({line})' if line else ''}, at {where}."
+        ) from exc
+
+
 class _Requirements:
     """The requirements that are met so far."""
 
@@ -145,7 +166,8 @@ class _Runs:
         for turn in range(self.n_inferences + max(episode.begins_after for episode in episodes)):
             begins = [one for one in episodes if one.begins_after == turn]
             if begins:
-                policy.reset([self._start(episode) for episode in begins])
+                with _named("reset", begins, chunk_size=self._spec.chunk_size):
+                    policy.reset([self._start(episode) for episode in begins])
             due = [one for one in episodes if 0 <= turn - one.begins_after < self.n_inferences]
             if alternating and turn % 2:
                 due.reverse()
@@ -158,12 +180,10 @@ class _Runs:
         """Return the error that a policy raises for the other sentence; from then on it gets its own."""
         try:
             self.run(policy, _Episode(seed=1))
-        except ConformanceError:
-            raise
-        except Exception as exc:  # the policy's own; without that sentence it is checked all the same
+        except _PolicyError as exc:  # without that sentence it is checked all the same
             own, other = self._instructions
             self._instructions = (own, own)
-            return f"“{other}” is an error: {type(exc).__name__}: {exc}"
+            return f"With “{other}”, {exc}"
         return None
 
     def _start(self, episode: _Episode) -> EpisodeStart:
@@ -181,9 +201,13 @@ class _Runs:
         windows = [self._window(episode) for episode in due]
         before = [_bytes(window) for window in windows]
         if isinstance(policy, BatchPolicy):
-            chunks = policy.act_batch(windows)
+            with _named("act_batch", due, chunk_size=self._spec.chunk_size):
+                chunks = policy.act_batch(windows)
         else:
-            chunks = [policy.act(window) for window in windows]
+            chunks = []
+            for episode, window in zip(due, windows, strict=True):
+                with _named("act", [episode], chunk_size=self._spec.chunk_size):
+                    chunks.append(policy.act(window))
         unchanged = [_bytes(window) for window in windows] == before
         claim(unchanged, "A policy leaves the observations as they are.", advice="Change a copy.")
         return chunks
