@@ -18,10 +18,14 @@ _PLACES = {
     "Run": "run",
     "check_policy": "checking",
     "evaluate": "evaluating",
+    "finetune": "finetuning",
     "list_policies": "listing",
     "list_tasks": "listing",
+    "load_dataset": "recording",
     "load_run": "run",
     "make_env": "environments",
+    "record": "recording",
+    "run_probe": "probing",
 }
 """Name -> its module in `vla_eval.api`, imported when it is first asked for; types: `__init__.pyi`."""
 

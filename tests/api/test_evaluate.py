@@ -216,7 +216,7 @@ def test_check_policy_takes_objects_and_names() -> None:
 
 def test_the_page_on_python_works_as_a_script(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
-    defined, read = (block.partition("```")[0] for block in page.split("```python\n")[1:])
+    defined, read, *_ = (block.partition("```")[0] for block in page.split("```python\n")[1:])
     small = defined.replace("episodes=20", 'episodes=2, simulator="fake", out="runs/mine"')
     (tmp_path / "script.py").write_text(f"{small}\n{read}\nprint(len(run.to_pandas('episodes')))", "utf-8")
     done = subprocess.run(

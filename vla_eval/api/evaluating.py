@@ -3,18 +3,18 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any  # policies are whatever the user gives; plain data
 
+from vla_eval.api.configured import configured, listed
 from vla_eval.api.run import Run, load_run
 from vla_eval.cli.terminal.progress import evaluate_with_progress, stop_on_signals
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import digest_of, load_recipe, to_data
+from vla_eval.config.files import digest_of
 from vla_eval.config.protocol import fill_from_protocol
-from vla_eval.errors import RecipeError
 from vla_eval.evaluation.resolve import FINGERPRINT_DIGITS, RUNS_FOLDER, ResolvedEvaluation
 from vla_eval.policies.entries import PolicyEntry, load_policy_entry
 from vla_eval.policies.given import given_entry
-from vla_eval.strict.decoding import decode
 from vla_eval.workers.in_process import IN_PROCESS
 from vla_eval.workers.local import LOCAL
 
@@ -52,24 +52,41 @@ def evaluate(
         VlaEvalError: a mistake that every episode would repeat; see `vla_eval.evaluation.evaluate`.
         KeyboardInterrupt: Ctrl-C; what has finished is kept, and the same call resumes.
     """
-    entries = _entries(policy)
-    given = {"tasks": _listed(tasks), "n_action_steps": _listed(n_action_steps), **fields}
-    if entries:
-        given["policies"] = [entry if isinstance(entry, str) else entry.name for entry in entries]
-    read = _config(config, {name: value for name, value in given.items() if value is not None})
-    policies = [
-        one if isinstance(one, PolicyEntry) else load_policy_entry(one) for one in entries or read.policies
-    ]
+    entries = entries_of(policy)
+    read = eval_config(
+        config, entries, {"tasks": tasks, "n_action_steps": n_action_steps, **fields}, where="evaluate"
+    )
+    return run_or_resume(
+        read,
+        entries or read.policies,
+        out=Path(out) if out else None,
+        in_process=in_process,
+        allow_environment_change=allow_environment_change,
+        command="vla_eval.evaluate(…)",
+    )
+
+
+def run_or_resume(
+    config: EvalConfig,
+    entries: Sequence[str | PolicyEntry],
+    *,
+    out: Path | None,
+    in_process: bool,
+    allow_environment_change: bool,
+    command: str,
+) -> Run:
+    """Run or resume one evaluation; arguments as for `evaluate`, with the policies as entries or names."""
+    policies = [one if isinstance(one, PolicyEntry) else load_policy_entry(one) for one in entries]
     backend = IN_PROCESS if in_process else LOCAL
-    resolved = ResolvedEvaluation.of(read, policies, backend=backend, out=Path(out) if out else None)
+    resolved = ResolvedEvaluation.of(config, policies, backend=backend, out=out)
     objects = {one.name: one.recipes[0].sha256 for one in entries if isinstance(one, PolicyEntry)}
     if objects and out is None:  # another version of the class is another run
         digest = digest_of([resolved.fingerprint, objects])[:FINGERPRINT_DIGITS]
-        resolved = replace(resolved, named_out=RUNS_FOLDER / f"{read.name}-{digest}")
+        resolved = replace(resolved, named_out=RUNS_FOLDER / f"{config.name}-{digest}")
     with stop_on_signals() as stop:
         summary = evaluate_with_progress(
             resolved,
-            command="vla_eval.evaluate(…)",
+            command=command,
             stop=stop,
             allow_environment_change=allow_environment_change,
             json_progress=None,
@@ -82,7 +99,30 @@ def evaluate(
     return load_run(summary.out)
 
 
-def _entries(policy: Any) -> list[str | PolicyEntry]:
+def eval_config(
+    config: EvalConfig | str | Path | None,
+    entries: Sequence[str | PolicyEntry],
+    given: Mapping[str, Any],
+    *,
+    where: str,
+    start: Mapping[str, Any] = MappingProxyType({}),
+) -> EvalConfig:
+    """Return the configuration of the evaluations that a function runs, with these policies."""
+    lists = {name: listed(given.get(name)) for name in ("tasks", "n_action_steps")}
+    names = [entry if isinstance(entry, str) else entry.name for entry in entries] or None
+    return configured(
+        EvalConfig,
+        config,
+        {**given, **lists, "policies": names},
+        folder="configs",
+        start={"name": str(given.get("protocol") or "eval"), **start},
+        needed={"tasks": "tasks", "policies": "policy"},
+        where=where,
+        edit=fill_from_protocol,
+    )
+
+
+def entries_of(policy: Any) -> list[str | PolicyEntry]:
     """Return names as they are, objects as entries."""
     if policy is None:
         return []
@@ -96,29 +136,3 @@ def _entry(found: Any, name: str | None) -> str | PolicyEntry:
     if isinstance(found, (str, Path)):
         return str(found) if name is None else f"{name}={found}"
     return given_entry(found, name=name)
-
-
-def _listed(value: Any) -> list[Any] | None:
-    if value is None:
-        return None
-    return list(value) if isinstance(value, (list, tuple, range)) else [value]
-
-
-def _config(config: EvalConfig | str | Path | None, given: Mapping[str, Any]) -> EvalConfig:
-    """Return the configuration with what is given on top."""
-
-    def edit(data: dict[str, Any]) -> None:
-        data.update(given)
-        fill_from_protocol(data)
-
-    if isinstance(config, (str, Path)):
-        return load_recipe("configs", str(config), EvalConfig, edit=edit).value
-    data = {"name": str(given.get("protocol") or "eval")} if config is None else to_data(config)
-    edit(data)
-    for field, argument in (("tasks", "tasks"), ("policies", "policy")):
-        if field not in data:
-            raise RecipeError(
-                f"evaluate: `{argument}` is missing. Expected a configuration, or at least tasks and policy: "
-                f'vla_eval.evaluate(policy="oracle", tasks="RememberColor3-v0")'
-            )
-    return decode(EvalConfig, data, where="evaluate")

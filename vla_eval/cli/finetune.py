@@ -24,6 +24,7 @@ from vla_eval.evaluation.model_table import is_model_table
 from vla_eval.strict.decoding import set_field
 
 if TYPE_CHECKING:
+    from vla_eval.cli.terminal.progress import StopRequest
     from vla_eval.training.request import FinetuneSummary
 
 DESCRIPTION = """Train a policy on a dataset, by the recipe in policies/NAME.yaml.
@@ -111,20 +112,34 @@ def run(args: argparse.Namespace) -> int:
             "fine-tuning runs on this machine; on several GPUs by `accelerate launch` (docs/finetuning.md)."
         )
     config, command = _config(args), typed_command()
-    from vla_eval.training.request import finished_run, look_for
-
-    look_for(config, is_dry=args.dry_run)
     if args.dry_run:
+        # Here and not above: `mikasa-vla --help` need not wait for numpy.
         from vla_eval.training.dry_run import describe_finetuning
+        from vla_eval.training.request import look_for
 
+        look_for(config, is_dry=True)
         with contextlib.redirect_stdout(sys.stderr), dry_run_options(args) as options:
             lines = describe_finetuning(config, options)
         print("\n".join(lines))
         return 0
+    summary, stop = finetune_with_progress(config, command=command)
+    if stop is not None:
+        print(f"Stopped at step {summary.step} in {summary.out}. To resume: {command}", file=sys.stderr)
+        return stop.exit_code
+    return _done(summary)
+
+
+def finetune_with_progress(
+    config: FinetuneConfig, *, command: str
+) -> "tuple[FinetuneSummary, StopRequest | None]":
+    """Fine-tune, or resume it, with lines on standard error; the request if a signal has stopped it."""
+    from vla_eval.training.request import finished_run, look_for
+
+    look_for(config)
     finished = finished_run(config)
     if finished is not None:
         print(finished, file=sys.stderr)
-        return _done(finished)
+        return finished, None
     # Here and not above: what is finished need not wait for torch.
     from tqdm import tqdm
 
@@ -139,10 +154,7 @@ def run(args: argparse.Namespace) -> int:
             say=lambda line: tqdm.write(line, file=sys.stderr),
             is_stopping=lambda: stop.is_asked,
         )
-    if not summary.is_finished:
-        print(f"Stopped at step {summary.step} in {summary.out}. To resume: {command}", file=sys.stderr)
-        return stop.exit_code
-    return _done(summary)
+    return summary, None if summary.is_finished else stop
 
 
 def _done(summary: "FinetuneSummary") -> int:

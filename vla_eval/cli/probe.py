@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -43,6 +43,7 @@ With --grid, chunk lengths against the lengths of the phases: what of the cue fa
 CONFIG is a file, or the name of one in configs/; without it, name at least one --task and one --policy.
 The controls oracle, cue_blind and body_memory are run as well. The same command resumes."""
 EPISODES = 50
+OUT = Path("runs/probe")
 
 
 def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
@@ -63,7 +64,7 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: t
         out="(runs/probe)",
         set="change any field of the evaluations",
     )
-    parser.set_defaults(out=Path("runs/probe"))
+    parser.set_defaults(out=OUT)
     for flag, (dest, kind, metavar, text) in INTERVENTIONS.items():
         many = NUMBERS if kind is int else {**MANY, "type": kind}
         parser.add_argument(flag, **many, dest=dest, metavar=metavar, help=text)
@@ -136,20 +137,29 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _settings(args: argparse.Namespace) -> "ProbeSettings":
+    words = None if args.probes is None else [word for words in args.probes for word in words]
+    return probe_settings({**vars(args), "probes": words}, controls=not args.no_controls)
+
+
+def probe_settings(chosen: Mapping[str, Any], *, controls: bool) -> "ProbeSettings":
+    """Return what a probe changes, from the values of its flags by name; None: the default."""
     from vla_eval.probe.interventions import INTERVENTIONS
     from vla_eval.probe.worlds import APPEARANCES, MASKS, ProbeSettings
 
-    chosen: dict[str, Any] = {  # Any: tuples of words or numbers
-        name: _numbers(getattr(args, name), name) for name in LEAST if name != "first_inferences"
+    numbers = {name: chosen.get(name) for name in LEAST if name != "first_inferences"}
+    settings: dict[str, Any] = {  # Any: tuples of words or numbers
+        name: _numbers(values, name) for name, values in numbers.items()
     }
-    if args.instructions is not None:
-        chosen["instructions"] = tuple(dict.fromkeys(args.instructions))
-    words = None if args.probes is None else [word for words in args.probes for word in words]
-    chosen["probes"] = _names(words, INTERVENTIONS, kind="probe", flag="--probe")
-    chosen["masks"] = _names(args.masks, MASKS, kind="mask", flag="--mask")
-    chosen["appearances"] = _names(args.appearances, APPEARANCES, kind="appearance", flag="--appearance")
-    given = {name: value for name, value in chosen.items() if value is not None}
-    return ProbeSettings(**given, controls=not args.no_controls)
+    if chosen.get("instructions") is not None:
+        settings["instructions"] = tuple(dict.fromkeys(chosen["instructions"]))
+    for name, known, kind in (
+        ("probes", INTERVENTIONS, "probe"),
+        ("masks", MASKS, "mask"),
+        ("appearances", APPEARANCES, "appearance"),
+    ):
+        settings[name] = _names(chosen.get(name), known, kind=kind, flag=f"--{kind}")
+    given = {name: value for name, value in settings.items() if value is not None}
+    return ProbeSettings(**given, controls=controls)
 
 
 def _grid_settings(args: argparse.Namespace) -> "GridSettings":

@@ -21,6 +21,7 @@ from vla_eval.config.files import apply_overrides
 from vla_eval.storage.shard import shard_folder
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.backend import Backend
+from vla_eval.workers.local import LOCAL
 from vla_eval.workers.needed_files import shared_folder
 
 if TYPE_CHECKING:
@@ -67,26 +68,24 @@ def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
 def run(args: argparse.Namespace) -> int:
     """Record and replay; the datasets' names go to standard output, everything else to standard error."""
     from vla_eval.cli.shared.output import hint_merge, hint_next
-    from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
-    from vla_eval.data.recording.record import record
+    from vla_eval.cli.terminal.progress import stop_on_signals
 
     recipe = _recipe(args)
     command = typed_command()
-    whole = args.out or DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
+    whole = args.out or default_folder(recipe)
     out = shard_folder(whole, args.shard)
     needs = (shared_folder(out),)
     with backend_of(args, needs=lambda: needs, notes_kinds=False) as backend, stop_on_signals() as stop:
-        with closing(RecordingProgress(stop, json_progress=args.json_progress)) as progress:
-            progress.say(cost(recipe))
-            summary = record(
-                recipe,
-                out=out,
-                command=command,
-                allow_environment_change=args.allow_environment_change,
-                observer=progress,
-                backend=backend,
-                part=args.shard,
-            )
+        summary = record_with_progress(
+            recipe,
+            stop,
+            out=out,
+            command=command,
+            allow_environment_change=args.allow_environment_change,
+            json_progress=args.json_progress,
+            backend=backend,
+            part=args.shard,
+        )
         if summary.was_stopped:
             print(f"Stopped. What was recorded is in {out}. To resume: {command}", file=sys.stderr)
             return stop.exit_code
@@ -98,7 +97,11 @@ def run(args: argparse.Namespace) -> int:
         if args.shard is not None:
             sys.stdout.flush()
             hint_merge(whole, args.shard)
-        code = _replay_new(summary, args, stop, workers=recipe.workers, backend=backend)
+        code = 0
+        if not args.no_replay:
+            code = replay_new(
+                summary, stop, workers=recipe.workers, backend=backend, json_progress=args.json_progress
+            )
     if stop.is_asked:
         print(f"Stopped in the replay check. To resume: {command}", file=sys.stderr)
     elif code == 0 and summary.datasets:
@@ -108,22 +111,43 @@ def run(args: argparse.Namespace) -> int:
     return code
 
 
-def _replay_new(
+def default_folder(recipe: DatasetRecipe) -> Path:
+    """Return the folder of a recipe's datasets if none is named."""
+    return DATA_FOLDER / f"{recipe.name}-{fingerprint(recipe)[:FINGERPRINT_DIGITS]}"
+
+
+def record_with_progress(
+    recipe: DatasetRecipe,
+    stop: "StopRequest",
+    *,
+    json_progress: int | None = None,
+    **arguments: Any,  # of `record`
+) -> "RecordingSummary":
+    """Record, or resume a recording, with progress on standard error."""
+    from vla_eval.cli.terminal.progress import RecordingProgress
+    from vla_eval.data.recording.record import record
+
+    with closing(RecordingProgress(stop, json_progress=json_progress)) as progress:
+        progress.say(cost(recipe))
+        return record(recipe, observer=progress, **arguments)
+
+
+def replay_new(
     summary: "RecordingSummary",
-    args: argparse.Namespace,
     stop: "StopRequest",
     *,
     workers: int | Literal["auto"],
-    backend: Backend,
+    backend: Backend = LOCAL,
+    json_progress: int | None = None,
 ) -> int:
     """Replay the datasets that no replay has passed yet; return the exit code."""
     from vla_eval.cli.terminal.progress import RecordingProgress
     from vla_eval.data.manifest import needs_replay
 
-    paths = [one.path for one in summary.datasets if not args.no_replay and needs_replay(one.path)]
+    paths = [one.path for one in summary.datasets if needs_replay(one.path)]
     if not paths:
         return 0
-    progress = RecordingProgress(stop, json_progress=args.json_progress)
+    progress = RecordingProgress(stop, json_progress=json_progress)
     return replay_each(paths, stop, progress, workers=workers, backend=backend)
 
 

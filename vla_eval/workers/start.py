@@ -24,7 +24,7 @@ from vla_eval.lock.switch import WRITING_VARIABLE, folders_for_workers, lock
 from vla_eval.storage.provenance import nvidia_driver_version
 from vla_eval.workers.children import SAFE_PATH
 from vla_eval.workers.guard import end_with_parent, fork_guarded
-from vla_eval.workers.server import IMPORTS_VARIABLE, PARENT_VARIABLE
+from vla_eval.workers.server import IMPORTS_VARIABLE, PARENT_VARIABLE, import_for_workers
 
 SERVER_MODULE = "vla_eval.workers.server"
 PROCESS_NAME = "mikasa-vla"
@@ -65,7 +65,7 @@ def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnC
     """Return what makes worker processes.
 
     The server imports the modules of `preload` before the first fork. It starts with the first worker of
-    this process; what is named later, workers import.
+    this process; what is named later, workers import before they are locked.
     """
     if nvidia_driver_version() is not None:
         return multiprocessing.get_context("spawn")
@@ -91,6 +91,8 @@ def begin(
     _leave_helpers()
     os.environ.clear()
     os.environ.update(environment)
+    import_for_workers()  # SAPIEN runs a program when it is imported, which the lock would refuse
+    del os.environ[IMPORTS_VARIABLE]
     lock()
     main(*args)
 
@@ -198,8 +200,8 @@ def worker_environment() -> Iterator[Mapping[str, str]]:
         added = {name: value for name, value in WORKER_ENVIRONMENT.items() if name not in os.environ}
         os.environ.update(added)
         try:
-            environment = {**os.environ, WRITING_VARIABLE: folders_for_workers()}
             os.environ[IMPORTS_VARIABLE] = ":".join(_preloaded)
+            environment = {**os.environ, WRITING_VARIABLE: folders_for_workers()}
             os.environ[PARENT_VARIABLE] = str(os.getpid())
             yield environment
         finally:

@@ -6,6 +6,7 @@ The bar is tqdm's; in a file, tqdm would write a bar per second, and rich nothin
 import sys
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 from tqdm import tqdm
@@ -35,8 +36,8 @@ class EpisodeBar:
         self._n_done = self._n_before = n_done
         self._n_total = n_total
         self._begun = self._last_line = self._clock()
-        if sys.stderr.isatty() and not self._is_quiet:
-            self._bar = tqdm(
+        if (sys.stderr.isatty() or _is_notebook()) and not self._is_quiet:
+            self._bar = _bar_class()(
                 total=n_total,
                 initial=n_done,
                 desc=printable(title) or None,  # tqdm adds codes of its own to what has some
@@ -113,3 +114,17 @@ class EpisodeBar:
             parts = [parts[0], *doing, "none has ended yet, so the remaining time is unknown"]
         parts += filter(None, (self._note, self._load))
         self.write((f"{self._title}: " if self._title else "") + ", ".join(parts))
+
+
+def _is_notebook() -> bool:
+    """Whether standard error is a cell of Jupyter, which draws a bar over itself as a terminal does."""
+    return type(sys.stderr).__module__.partition(".")[0] == "ipykernel"
+
+
+def _bar_class() -> "type[tqdm[Any]]":
+    """Return tqdm's bar for this place: a widget in Jupyter, where ipywidgets is installed."""
+    if not _is_notebook() or find_spec("ipywidgets") is None:
+        return tqdm
+    from tqdm.notebook import tqdm as widget
+
+    return widget

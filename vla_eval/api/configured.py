@@ -1,0 +1,71 @@
+"""Configurations from the arguments of a function: what a verb makes of a file and flags."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any  # plain data, whatever the user gives
+
+from vla_eval.config.files import Folder, load_recipe, to_data
+from vla_eval.errors import RecipeError
+from vla_eval.strict.decoding import decode
+from vla_eval.tasks.catalog import with_version
+
+
+def configured[C](
+    cls: type[C],
+    config: C | str | Path | None,
+    given: Mapping[str, Any],
+    *,
+    folder: Folder,
+    start: Mapping[str, Any],
+    needed: Mapping[str, str],
+    where: str,
+    edit: Callable[[dict[str, Any]], None] = lambda _data: None,
+) -> C:
+    """Return a configuration, its file, or the fields `start`, with what is given on top.
+
+    Args:
+        cls: the class of the configuration.
+        config: one, or a file, or a name in `folder`; None: the arguments say it all.
+        given: field -> value; None: the argument was not given.
+        folder: where names are looked up.
+        start: the fields without a configuration.
+        needed: field -> the argument that must give it if there is no configuration.
+        where: the function, for messages.
+        edit: changes the data after that.
+
+    Raises:
+        RecipeError: an argument is missing, or a field does not exist or cannot have this value.
+    """
+
+    def complete(data: dict[str, Any]) -> None:
+        data.update({name: value for name, value in given.items() if value is not None})
+        edit(data)
+        if isinstance(data.get("tasks"), list):  # anything else is refused when it is decoded
+            data["tasks"] = [with_version(one) if isinstance(one, str) else one for one in data["tasks"]]
+
+    if isinstance(config, (str, Path)):
+        return load_recipe(folder, str(config), cls, edit=complete).value
+    data = dict(start) if config is None else to_data(config)
+    complete(data)
+    missing = [argument for field, argument in needed.items() if field not in data]
+    if missing:
+        raise RecipeError(
+            f"{where}: `{missing[0]}` is missing. Expected a configuration, or at least "
+            f"{' and '.join(needed.values())}: vla_eval.{where}({EXAMPLES[where]})"
+        )
+    return decode(cls, data, where=where)
+
+
+EXAMPLES = {
+    "evaluate": 'policy="oracle", tasks="RememberColor3-v0"',
+    "run_probe": 'policy="oracle", tasks="RememberColor3-v0"',
+    "record": 'tasks="RememberColor3-v0", episodes=10',
+    "finetune": 'policy="act", dataset="data/RememberColor3-v0", steps=20000',
+}
+
+
+def listed(value: Any) -> list[Any] | None:
+    """Return one or several as a list; None stays."""
+    if value is None:
+        return None
+    return list(value) if isinstance(value, (list, tuple, range)) else [value]
