@@ -121,7 +121,7 @@ def _is_notebook() -> bool:
     return type(sys.stderr).__module__.partition(".")[0] == "ipykernel"
 
 
-def _bar_class() -> "type[tqdm[Any]]":
+def _bar_class() -> Any:  # tqdm is untyped
     """Return tqdm's bar for this place: a widget in Jupyter, where ipywidgets is installed."""
     if not _is_notebook() or find_spec("ipywidgets") is None:
         return tqdm
