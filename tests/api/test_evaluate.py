@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import vla_eval
+from vla_eval.api.evaluating import entries_of
 from vla_eval.cli.main import main
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import RecipeError, VlaEvalError
@@ -242,3 +243,17 @@ def test_an_exception_names_the_line_of_the_policy_and_the_step(in_process: bool
     run = vla_eval.evaluate(policy=Raises, tasks=TASK, out=tmp_path / "run", in_process=in_process, **FAST)
     said = f"division by zero (test_evaluate.py, line {number}, at control step 2)"
     assert [record.error and record.error.message for record in run.records] == [said] * 3
+
+
+def test_a_mapping_of_tasks_is_one_policy_with_a_checkpoint_for_each() -> None:
+    given = {
+        "mine": {"RememberColor3-v0": "runs/three", "RememberColor9-v0": Path("runs/nine")},
+        "still": "hold",
+    }
+    assert entries_of(given) == [
+        "mine:RememberColor3-v0=runs/three",
+        "mine:RememberColor9-v0=runs/nine",
+        "still=hold",
+    ]
+    with pytest.raises(RecipeError, match="expected the folder of a checkpoint for each task"):
+        entries_of({"mine": {"RememberColor3-v0": Still()}})

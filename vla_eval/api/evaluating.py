@@ -12,6 +12,7 @@ from vla_eval.cli.terminal.progress import evaluate_with_progress, stop_on_signa
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of
 from vla_eval.config.protocol import fill_from_protocol
+from vla_eval.errors import RecipeError
 from vla_eval.evaluation.resolve import FINGERPRINT_DIGITS, RUNS_FOLDER, ResolvedEvaluation
 from vla_eval.policies.entries import PolicyEntry, load_policy_entry
 from vla_eval.policies.given import given_entry
@@ -39,7 +40,8 @@ def evaluate(
     Args:
         config: a configuration, its file, or the name of one in `configs/`; None: the arguments say it all.
         policy: one policy or a list of them: a name as for `--policy`, an instance, a class, or a function
-            that makes one from a `PolicyContext` or from nothing. A mapping gives them names for the table.
+            that makes one from a `PolicyContext` or from nothing. A mapping gives them names for the table;
+            in it, `{"mine": {task: folder}}` is one policy with a checkpoint for each task.
         tasks: one task id or several.
         n_action_steps: one number or several: actions executed per inference (K).
         out: the run folder; None: one in `runs/`, for each configuration and each version of the policies.
@@ -127,7 +129,11 @@ def entries_of(policy: Any) -> list[str | PolicyEntry]:
     if policy is None:
         return []
     if isinstance(policy, Mapping):
-        return [_entry(found, str(name)) for name, found in policy.items()]
+        return [
+            _entry(found, str(name) if task is None else f"{name}:{task}")
+            for name, value in policy.items()
+            for task, found in (value.items() if isinstance(value, Mapping) else [(None, value)])
+        ]
     several = policy if isinstance(policy, (list, tuple)) else [policy]
     return [_entry(one, None) for one in several]
 
@@ -135,4 +141,9 @@ def entries_of(policy: Any) -> list[str | PolicyEntry]:
 def _entry(found: Any, name: str | None) -> str | PolicyEntry:
     if isinstance(found, (str, Path)):
         return str(found) if name is None else f"{name}={found}"
+    if name is not None and ":" in name:
+        raise RecipeError(
+            f"policy '{name}': expected the folder of a checkpoint for each task, found {found!r:.80}. A "
+            "policy object is given by itself: it gets its task in `reset`."
+        )
     return given_entry(found, name=name)
