@@ -10,12 +10,10 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
-from typing import Any
 
 import pytest
 
 from vla_eval.cli import main as cli
-from vla_eval.cli.shared.arguments import add_verb
 from vla_eval.data.checks import rules
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.errors import DatasetError, RecipeError
@@ -98,8 +96,8 @@ def test_a_verb_is_a_file_and_a_name(
 ) -> None:
     toy = ModuleType("vla_eval.cli.greet")
 
-    def add_parser(subparsers: Any) -> None:
-        add_verb(subparsers, "greet", help="say hello").add_argument("--whom", required=True)
+    def add_arguments(parser: argparse.ArgumentParser) -> None:
+        parser.add_argument("--whom", required=True)
 
     def run(args: argparse.Namespace) -> int:
         if not args.whom.strip():
@@ -107,9 +105,9 @@ def test_a_verb_is_a_file_and_a_name(
         print(f"hello {args.whom}")
         return 0
 
-    vars(toy).update(add_parser=add_parser, run=run)
+    vars(toy).update(add_arguments=add_arguments, run=run)
     monkeypatch.setitem(sys.modules, toy.__name__, toy)
-    monkeypatch.setattr(cli, "VERBS", (*cli.VERBS, "greet"))
+    monkeypatch.setattr(cli, "VERBS", {**cli.VERBS, "greet": "say hello"})
     assert cli.main(["greet", "--whom", "robot"]) == 0
     assert capsys.readouterr().out == "hello robot\n"
     assert cli.main(["greet", "--whom", " "]) == 1

@@ -103,7 +103,7 @@ def test_the_help_names_every_column(capsys: pytest.CaptureFixture[str]) -> None
     known = re.search(r"Known: (.*)\.", str(error.value))
     assert known is not None
     parser = argparse.ArgumentParser()
-    report_verb.add_parser(parser.add_subparsers())
+    report_verb.add_arguments(parser.add_subparsers().add_parser("report"))
     with pytest.raises(SystemExit):
         parser.parse_args(["report", "--help"])
     told = capsys.readouterr().out.partition("for reading:")[2].partition("--html")[0]
@@ -172,7 +172,7 @@ def test_tasks_that_the_paper_did_not_measure_get_no_figures() -> None:
 
 def arguments(*words: str) -> argparse.Namespace:
     parser = argparse.ArgumentParser()
-    report_verb.add_parser(parser.add_subparsers(dest="verb"))
+    report_verb.add_arguments(parser.add_subparsers(dest="verb").add_parser("report"))
     return parser.parse_args(["report", *words])
 
 
@@ -215,7 +215,8 @@ def test_help_does_not_wait_for_scipy_and_a_report_needs_no_torch(run_folder: Pa
     code = (
         "import sys, argparse, vla_eval.cli.report as verb\n"
         "print('scipy' in sys.modules)\n"
-        "parser = argparse.ArgumentParser(); verb.add_parser(parser.add_subparsers())\n"
+        "parser = argparse.ArgumentParser()\n"
+        "verb.add_arguments(parser.add_subparsers().add_parser('report'))\n"
         f"verb.run(parser.parse_args(['report', {str(run_folder)!r}]))\n"
         "heavy = ('torch', 'sapien', 'mani_skill', 'lerobot', 'cv2', 'rerun', 'pandas')\n"
         "print([name for name in heavy if name in sys.modules])"

@@ -51,7 +51,7 @@ def test_a_statistic_that_is_added_is_named_by_the_help(
     with_toy: Table, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parser = argparse.ArgumentParser()
-    report_verb.add_parser(parser.add_subparsers())
+    report_verb.add_arguments(parser.add_subparsers().add_parser("report"))
     with pytest.raises(SystemExit):
         parser.parse_args(["report", "--help"])
     assert " toy " in capsys.readouterr().out

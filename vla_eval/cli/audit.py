@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_flags, add_verb, env_paths
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_flags, env_paths
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
@@ -20,15 +20,9 @@ first choice is final. The official package's tasks (--suite mikasa_vla_90) have
 command resumes a stopped audit."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "audit",
-        help="find the tasks that can be won without memory",
-        description=DESCRIPTION,
-        epilog="docs/audit.md explains controls, tests and verdicts.",
-    )
+    parser.description, parser.epilog = DESCRIPTION, "docs/audit.md explains controls, tests and verdicts."
     which = parser.add_mutually_exclusive_group()
     which.add_argument("--task", **{**FLAGS["--task"], "help": "task ids (all of the suite)"})
     which.add_argument(

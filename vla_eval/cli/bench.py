@@ -17,11 +17,8 @@ MAX_WORKERS, MAX_MEASURED_EPISODES = 256, 10_000
 MIB = 2**20
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the verb to the command line."""
-    parser = subparsers.add_parser(
-        "bench", help="measure rendering, loading or serving, as ratios from one run"
-    )
     parser.add_argument(
         "--task", type=task_argument, default="RememberColor3-v0", help="task id (default: %(default)s)"
     )

@@ -3,9 +3,8 @@
 import argparse
 import functools
 import sys
-from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb, api_key_of, task_argument
+from vla_eval.cli.shared.arguments import api_key_of, task_argument
 from vla_eval.errors import RecipeError
 
 URL_SCHEMES = ("ws://", "wss://")
@@ -21,15 +20,9 @@ One line per requirement that is met."""
 EPILOG = "exit codes: 0 all requirements are met; 1 one is not, or a mistake; 130 stopped by Ctrl-C."
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "check",
-        help="check whether a policy, or a policy server, keeps its contract",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
+    parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("policy", metavar="POLICY", help="name, file, folder, or ws://HOST:PORT")
     parser.add_argument(
         "--task",

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_old_flag, add_verb
+from vla_eval.cli.shared.arguments import add_old_flag
 from vla_eval.errors import MAX_SHOWN, CheckpointError
 from vla_eval.models.families import FAMILIES, bases
 from vla_eval.models.family import imported
@@ -32,15 +32,10 @@ seconds and peak memory. The checkpoint is removed afterwards. With the folder o
 is loaded instead, and nothing is written."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "checkpoint",
-        help="check a checkpoint, or convert an original one",
-        description=DESCRIPTION,
-        epilog=f"{', '.join(PAGES[:-1])} and {PAGES[-1]} explain converting.",
-    )
+    parser.description = DESCRIPTION
+    parser.epilog = f"{', '.join(PAGES[:-1])} and {PAGES[-1]} explain converting."
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     verify = actions.add_parser("verify", help="load it strictly and let it act once", allow_abbrev=False)
     verify.add_argument("path", metavar="PATH", help="a LeRobot checkpoint, or a run of ours")

@@ -3,9 +3,8 @@
 import argparse
 import sys
 from pathlib import Path
-from typing import Any
 
-from vla_eval.cli.shared.arguments import add_flags, add_verb
+from vla_eval.cli.shared.arguments import add_flags
 from vla_eval.cli.shared.output import print_in
 from vla_eval.cli.terminal.screen import screen_width
 from vla_eval.results.formats import COMPARED_BY
@@ -17,15 +16,9 @@ test against a reference, and how many episodes would settle a difference.
 Each RUN is a folder that `mikasa-vla eval` made; several are put together."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "compare",
-        help="compare chunk lengths or policies with a reference",
-        description=DESCRIPTION,
-        epilog="docs/chunk_sizes.md explains the columns.",
-    )
+    parser.description, parser.epilog = DESCRIPTION, "docs/chunk_sizes.md explains the columns."
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="run folder (runs/…)")
     parser.add_argument("--by", choices=COMPARED_BY, default="n_action_steps", help="(n_action_steps)")
     parser.add_argument(

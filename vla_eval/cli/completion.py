@@ -6,9 +6,7 @@ Not by shtab: it completes no names by verb, and would be another dependency.
 import argparse
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
-
-from vla_eval.cli.shared.arguments import add_verb
+from typing import NamedTuple
 
 DESCRIPTION = """Print what a shell needs to complete verbs, flags, and names of tasks, policies and configs.
 
@@ -30,14 +28,9 @@ class Words(NamedTuple):
     names: Mapping[str, Sequence[str]]  # verb -> the names that may follow it
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "completion",
-        help="print the completion for a shell",
-        description=DESCRIPTION,
-    )
+    parser.description = DESCRIPTION
     parser.add_argument("shell", choices=tuple(_SHELLS), help="the shell")
 
 

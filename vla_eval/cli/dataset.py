@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from vla_eval.cli.shared.arguments import add_flags, seeds_argument, task_argument
 from vla_eval.errors import DatasetError
@@ -19,11 +19,8 @@ if TYPE_CHECKING:
 MAX_SENTENCES = 5  # that `check` shows
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the actions and their arguments."""
-    parser = subparsers.add_parser(
-        "dataset", help="convert, mix, describe or share datasets", allow_abbrev=False
-    )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", title="actions", required=True)
     action = functools.partial(actions.add_parser, allow_abbrev=False)
 

@@ -3,22 +3,17 @@
 import argparse
 import dataclasses
 import json
-from typing import Any
 
 from vla_eval.doctor import CHECKS, Finding, run_probe
 
+DESCRIPTION = """Check Python, packages, drivers and disk, render an image and run an episode. The exit
+code is 1 if something is missing that evaluations need."""
 EXIT_FAILED = 1
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments of `doctor`."""
-    parser = subparsers.add_parser(
-        "doctor",
-        help="check this machine and say what to do",
-        description="Check Python, packages, drivers and disk, render an image and run an episode. "
-        "The exit code is 1 if something is missing that evaluations need.",
-        allow_abbrev=False,
-    )
+    parser.description = DESCRIPTION
     parser.add_argument(
         "--cluster",
         nargs="?",

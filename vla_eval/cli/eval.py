@@ -10,7 +10,6 @@ from vla_eval.cli.shared.arguments import (
     FLAGS,
     add_flags,
     add_old_flag,
-    add_verb,
     env_paths,
     positive_argument,
     read_config,
@@ -43,15 +42,9 @@ RECIPE_FLAGS = (
 )
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "eval",
-        help="run or resume an evaluation, and print its table",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
+    parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     parser.add_argument(
         "--protocol",

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 from vla_eval.cli.shared.arguments import (
     add_flags,
     add_old_flag,
-    add_verb,
     dry_run_options,
     memory_argument,
     positive_argument,
@@ -40,15 +39,9 @@ EPILOG = """docs/finetuning.md explains recipes, memory and resuming. Exit codes
 1 a mistake; 130, 143 stopped by Ctrl-C, SIGTERM, with a checkpoint (the same command resumes)."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "finetune",
-        help="train a policy on a dataset, or resume the training",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
+    parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     parser.add_argument(
         "--policy",

@@ -2,9 +2,7 @@
 
 import argparse
 from pathlib import Path
-from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb
 from vla_eval.cli.shared.output import hint_next
 from vla_eval.config.files import check_recorded_name
 from vla_eval.errors import MAX_SHOWN, RecipeError
@@ -37,11 +35,9 @@ seed_start: 1  # demonstrations have seeds from 1000 on
 """
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers, "init", help="write a configuration with comments to start from", description=DESCRIPTION
-    )
+    parser.description = DESCRIPTION
     parser.add_argument(
         "file", nargs="?", type=Path, default=Path("eval.yaml"), metavar="FILE", help="(eval.yaml)"
     )

@@ -3,7 +3,6 @@
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from vla_eval.checkpoints.bases import FIRST_TRAININGS
 from vla_eval.cli.terminal.screen import NARROWEST, filled, screen_width
@@ -36,13 +35,8 @@ TINY_SUFFIX = "_tiny"  # of the names of recipes for tests
 RecipeClass = type[EvalConfig | ModelTable | DatasetRecipe | Protocol | PromptRecipe]
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser(
-        "list",
-        help="list tasks, families, policies, configs, prompts, datasets, protocols",
-        allow_abbrev=False,
-    )
     parser.add_argument("kind", nargs="?", choices=tuple(_LISTS), help="only these (default: all)")
     parser.add_argument(
         "--suite",

@@ -1,6 +1,6 @@
 """The command `mikasa-vla`: find the verb, run it, turn a user's mistake into one message.
 
-Each verb is a module with `add_parser(subparsers)` and `run(args) -> int`, imported when it is needed.
+Each verb is a module with `add_arguments(parser)` and `run(args) -> int`, imported when it is needed.
 """
 
 import argparse
@@ -9,7 +9,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn, Protocol, cast
 
@@ -21,28 +21,29 @@ from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
 from vla_eval.workers.children import leave_working_directory
 
 PROGRAM = "mikasa-vla"
-VERBS = (
-    "init",
-    "eval",
-    "report",
-    "merge",
-    "compare",
-    "check",
-    "audit",
-    "probe",
-    "view",
-    "record",
-    "replay",
-    "dataset",
-    "finetune",
-    "checkpoint",
-    "serve",
-    "list",
-    "show",
-    "doctor",
-    "bench",
-    "completion",
-)
+VERBS: Mapping[str, str] = {
+    "init": "write a configuration with comments to start from",
+    "eval": "run or resume an evaluation, and print its table",
+    "report": "print the success table of run folders",
+    "merge": "put the shards of a run together",
+    "compare": "compare chunk lengths or policies with a reference",
+    "check": "check whether a policy, or a policy server, keeps its contract",
+    "audit": "find the tasks that can be won without memory",
+    "probe": "find out what a policy remembers, and for how long",
+    "view": "open captured episodes, or a dataset's, in the rerun viewer",
+    "record": "record demonstrations as LeRobot datasets, or resume recording",
+    "replay": "check a dataset by running its episodes again",
+    "dataset": "convert, mix, describe or share datasets",
+    "finetune": "train a policy on a dataset, or resume the training",
+    "checkpoint": "check a checkpoint, or convert an original one",
+    "serve": "serve a policy to simulators and other clients over WebSocket",
+    "list": "list tasks, families, policies, configs, prompts, datasets, protocols",
+    "show": "explain a task, policy, configuration, dataset, protocol or folder",
+    "doctor": "check this machine and say what to do",
+    "bench": "measure rendering, loading or serving, as ratios from one run",
+    "completion": "print the completion for a shell",
+}
+"""Verb -> its line in the help."""
 FIRST_STEPS = f"""{PROGRAM} {__version__}: does a robot policy remember?
 
   {PROGRAM} eval demo
@@ -66,8 +67,8 @@ EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells do it
 class Verb(Protocol):
     """What the module of a verb offers."""
 
-    def add_parser(self, subparsers: "argparse._SubParsersAction[_Parser]") -> None:
-        """Declare the verb's arguments; imports nothing heavy."""
+    def add_arguments(self, parser: argparse.ArgumentParser) -> None:
+        """Declare the verb's arguments and texts; imports nothing heavy."""
 
     def run(self, args: argparse.Namespace) -> int:
         """Do it; returns the exit code."""
@@ -135,7 +136,7 @@ def _run(arguments: list[str]) -> int:
     return code
 
 
-def build_parser(verbs: Sequence[str] = VERBS) -> argparse.ArgumentParser:
+def build_parser(verbs: Iterable[str] = VERBS) -> argparse.ArgumentParser:
     """Return the parser of these verbs, whose modules are imported: a single one starts faster."""
     parser = _Parser(
         prog=PROGRAM,
@@ -145,8 +146,10 @@ def build_parser(verbs: Sequence[str] = VERBS) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"{PROGRAM} {__version__}")
     subparsers = parser.add_subparsers(dest="verb", metavar="VERB", title="verbs")
     for verb in verbs:
-        _verb(verb).add_parser(subparsers)
-    for below in subparsers.choices.values():
+        # Texts are printed as they are written.
+        form = argparse.RawDescriptionHelpFormatter
+        below = subparsers.add_parser(verb, help=VERBS[verb], formatter_class=form, allow_abbrev=False)
+        _verb(verb).add_arguments(below)
         _add_no_lock(below)
     return parser
 

@@ -4,9 +4,9 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, add_flags, add_verb
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, add_flags
 from vla_eval.errors import MergeError
 from vla_eval.storage.folders import not_a_run_folder
 from vla_eval.storage.run_file import RUN_FILE
@@ -24,15 +24,9 @@ EPILOG = """exit codes: 0 merged; 1 a mistake, or something is missing (see the 
 episodes ended in an error (the command without --shard, with --out DIR, retries them)."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "merge",
-        help="put the shards of a run together",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
+    parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder of a shard")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="the new folder")
     parser.add_argument(

@@ -11,7 +11,6 @@ from vla_eval.cli.shared.arguments import (
     MANY,
     NUMBERS,
     add_flags,
-    add_verb,
     env_paths,
     read_config,
     set_flags,
@@ -46,15 +45,9 @@ EPISODES = 50
 OUT = Path("runs/probe")
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "probe",
-        help="find out what a policy remembers, and for how long",
-        description=DESCRIPTION,
-        epilog="docs/probe.md defines each quantity.",
-    )
+    parser.description, parser.epilog = DESCRIPTION, "docs/probe.md defines each quantity."
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     add_flags(
         parser,

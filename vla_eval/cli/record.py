@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from vla_eval.cli.shared.arguments import (
     add_flags,
-    add_verb,
     env_paths,
     read_config,
     set_flags,
@@ -42,15 +41,9 @@ EPILOG = """exit codes: 0 all datasets are there; 1 a mistake, or a mismatch in 
 130, 143 stopped by Ctrl-C, SIGTERM (the same command resumes)."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "record",
-        help="record demonstrations as LeRobot datasets, or resume recording",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
+    parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("recipe", nargs="?", metavar="RECIPE", help="file, or name in datasets/")
     add_flags(
         parser,

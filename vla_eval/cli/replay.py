@@ -4,9 +4,8 @@ import argparse
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
-from vla_eval.cli.shared.arguments import NUMBERS, add_flags, add_verb
+from vla_eval.cli.shared.arguments import NUMBERS, add_flags
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.errors import RecipeError
@@ -20,15 +19,9 @@ DATASET is the folder of one dataset, or one that holds some (OUT of `mikasa-vla
 EPILOG = "exit codes: 0 no mismatch; 1 a mismatch, or a mistake; 130, 143 stopped by Ctrl-C, SIGTERM."
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "replay",
-        help="check a dataset by running its episodes again",
-        description=DESCRIPTION,
-        epilog=EPILOG,
-    )
+    parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("dataset", type=Path, metavar="DATASET", help="folder of a dataset, or of some")
     parser.add_argument("--episodes", **NUMBERS, metavar="N", help="only these (default: all)")
     parser.add_argument("--pixels", action="store_true", help="render, and compare images and video, too")

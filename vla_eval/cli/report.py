@@ -4,9 +4,8 @@ import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from vla_eval.cli.shared.arguments import add_verb
 from vla_eval.cli.shared.output import add_table_arguments, print_in, print_table
 from vla_eval.cli.terminal.screen import print_markdown
 
@@ -23,15 +22,9 @@ With --html, a page with plots, choices, errors and videos is written instead, a
 --filmstrip, an image per row of the table: ten seeds, cue | reveal | touch."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "report",
-        help="print the success table of run folders",
-        description=DESCRIPTION,
-        epilog="The columns are explained in docs/statistics.md.",
-    )
+    parser.description, parser.epilog = DESCRIPTION, "The columns are explained in docs/statistics.md."
     parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="run folder (runs/…)")
     add_table_arguments(parser)
     parser.add_argument(

@@ -5,9 +5,8 @@ import ipaddress
 import logging
 import os
 import sys
-from typing import Any
 
-from vla_eval.cli.shared.arguments import add_verb, api_key_of, task_argument
+from vla_eval.cli.shared.arguments import api_key_of, task_argument
 from vla_eval.errors import MAX_SHOWN
 from vla_eval.workers.start import WORKER_ENVIRONMENT
 
@@ -16,14 +15,9 @@ evaluates it, and openpi's own client gets chunks from it. Requests of several c
 network; an answer does not depend on who else is there."""
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "serve",
-        help="serve a policy to simulators and other clients over WebSocket",
-        description=DESCRIPTION,
-    )
+    parser.description = DESCRIPTION
     parser.add_argument(
         "--policy", required=True, metavar="P", help="name in policies/, file, or folder of a checkpoint"
     )

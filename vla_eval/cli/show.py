@@ -8,7 +8,7 @@ import os
 import textwrap
 from dataclasses import fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from vla_eval.cli.terminal.screen import filled
 from vla_eval.config.dataset import DatasetRecipe
@@ -51,11 +51,8 @@ KINDS: dict[Folder, _Kind] = {
 }
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = subparsers.add_parser(
-        "show", help="explain a task, policy, configuration, dataset, protocol or folder", allow_abbrev=False
-    )
     parser.add_argument(
         "name", metavar="NAME", help="task id, name or file of a recipe (`mikasa-vla list`), or a folder"
     )

@@ -6,9 +6,8 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
-from vla_eval.cli.shared.arguments import NUMBERS, add_verb, task_argument
+from vla_eval.cli.shared.arguments import NUMBERS, task_argument
 from vla_eval.lock.switch import own_need
 
 DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd …` captured in the rerun viewer.
@@ -20,15 +19,9 @@ DATASET_FILE = Path("meta") / "info.json"
 RUN_FLAGS = {"--task": "task", "--policy": "policy", "--n-action-steps": "n_action_steps"}
 
 
-def add_parser(subparsers: "argparse._SubParsersAction[Any]") -> None:  # Any: the parser class is main's
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser = add_verb(
-        subparsers,
-        "view",
-        help="open captured episodes, or a dataset's, in the rerun viewer",
-        description=DESCRIPTION,
-        epilog="docs/captures.md says what is in the files.",
-    )
+    parser.description, parser.epilog = DESCRIPTION, "docs/captures.md says what is in the files."
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder (runs/…), or a dataset")
     parser.add_argument("--seed", type=int, metavar="S", help="only this seed")
     parser.add_argument("--task", type=task_argument, metavar="T", help="only this task")

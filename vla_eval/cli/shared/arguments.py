@@ -26,12 +26,6 @@ EXIT_EPISODE_ERRORS = 3
 """All episodes were run, and some ended in an error."""
 
 
-def add_verb(subparsers: "argparse._SubParsersAction[Any]", name: str, **texts: Any) -> Any:
-    """Add a verb whose texts are printed as they are written; its flags cannot be abbreviated."""
-    formatter = argparse.RawDescriptionHelpFormatter
-    return subparsers.add_parser(name, formatter_class=formatter, allow_abbrev=False, **texts)
-
-
 def typed_command() -> str:
     """Return the command that is running, as a shell takes it."""
     return shlex.join(["mikasa-vla", *sys.argv[1:]])
