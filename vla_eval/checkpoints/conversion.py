@@ -118,7 +118,7 @@ def _copy_tokenizer(source: Path, folder: Path) -> Path:
 NOT_COPIED = (ADAPTER_CONFIG_FILE, ADAPTER_WEIGHTS_FILE, "README.md", "train_config.json")
 
 
-def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None, device: str = "cpu") -> Path:
+def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None) -> Path:
     """Write a checkpoint `out` whose weights are base plus adapter; return it.
 
     Sums are made in the precision of the base: in bfloat16 the actions differ by its rounding. Without
@@ -128,7 +128,7 @@ def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None, 
     if not (folder / ADAPTER_CONFIG_FILE).is_file():
         raise CheckpointError(f"{folder}: expected a LoRA adapter, found no LoRA adapter but a whole model.")
     check_free(out)
-    options = LoadOptions(device=device, base_checkpoint=base_checkpoint)
+    options = LoadOptions(device="cpu", base_checkpoint=base_checkpoint)
     config = read_config(folder, options)
     merged = load_weights(folder, config, options).merge_and_unload()
     described = {**read_json(folder / CONFIG_FILE), "use_peft": False, "pretrained_path": None}

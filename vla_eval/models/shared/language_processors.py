@@ -4,10 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any  # lerobot is untyped
 
-from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.processor import (
     ComplementaryDataProcessorStep,
     DeviceProcessorStep,
+    IdentityProcessorStep,
     TokenizerProcessorStep,
     make_default_policy_processor_steps,
     make_policy_processor_pipelines,
@@ -27,6 +27,8 @@ BYTE_SPECIAL = ("<pad>", "<s>", "</s>")  # tokens 0, 1 and 2: padding, begin and
 class InstructionStep(ComplementaryDataProcessorStep):  # type: ignore[misc]  # lerobot is untyped
     """Puts a policy's words around the instruction; a policy registers its own with a `prompt` method."""
 
+    transform_features = IdentityProcessorStep.transform_features
+
     def prompt(self, instruction: str) -> str:
         """Return the prompt of one instruction."""
         raise NotImplementedError
@@ -40,12 +42,6 @@ class InstructionStep(ComplementaryDataProcessorStep):  # type: ignore[misc]  # 
             )
         texts = [tasks] if isinstance(tasks, str) else list(tasks)
         return {**complementary_data, TASK: [self.prompt(str(text)) for text in texts]}
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Change no field's shape."""
-        return features
 
 
 def language_processors(

@@ -10,9 +10,8 @@ from dataclasses import dataclass, field
 from typing import Any  # lerobot is untyped
 
 import torch
-from lerobot.configs import PipelineFeatureType, PolicyFeature
 from lerobot.lerobot_types import EnvTransition, TransitionKey
-from lerobot.processor import ProcessorStep, ProcessorStepRegistry
+from lerobot.processor import IdentityProcessorStep, ProcessorStep, ProcessorStepRegistry
 from torch import Tensor
 
 from vla_eval.errors import CheckpointError, RecipeError
@@ -31,6 +30,7 @@ class _Statistics(ProcessorStep):  # type: ignore[misc]  # lerobot is untyped
     gripper: Gripper = field(default_factory=Gripper)
     stats: dict[str, dict[str, Any]] | None = None
     _normalizers: dict[str, Normalizer] = field(default_factory=dict, init=False, repr=False)
+    transform_features = IdentityProcessorStep.transform_features
 
     def __post_init__(self) -> None:
         """Accept what JSON made of the specifications; keep only the statistics that are used."""
@@ -78,12 +78,6 @@ class _Statistics(ProcessorStep):  # type: ignore[misc]  # lerobot is untyped
             key, _, name = flat.rpartition("/")
             stats.setdefault(key, {})[name] = values
         self._use(stats)
-
-    def transform_features(
-        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
-    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
-        """Change no field's shape."""
-        return features
 
     def _use(self, stats: Mapping[str, Mapping[str, Any]]) -> None:
         for key, spec in self.fields.items():

@@ -99,12 +99,10 @@ def check_fit(
     return sources
 
 
-def check_same(
-    actual: Mapping[str, Tensor], expected: Mapping[str, Tensor], *, where: str, partial: bool = False
-) -> None:
-    """Raise `CheckpointError` unless a model has the file's tensors, finite; `partial`: it may have more."""
+def check_same(actual: Mapping[str, Tensor], expected: Mapping[str, Tensor], *, where: str) -> None:
+    """Raise `CheckpointError` unless a model has the file's tensors, finite."""
     problems = {
-        "missing": [] if partial else [key for key in actual if key not in expected],
+        "missing": [key for key in actual if key not in expected],
         "unexpected": [key for key in expected if key not in actual],
         "not taken over": [
             key
