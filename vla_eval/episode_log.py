@@ -13,12 +13,7 @@ from numpy.typing import NDArray
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
-from vla_eval.errors import (
-    InvalidActionError,
-    MissingInstructionError,
-    SimulationError,
-    SpecMismatchError,
-)
+from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError, SpecMismatchError
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.task_state import TaskStatus

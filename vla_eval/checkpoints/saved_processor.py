@@ -21,13 +21,7 @@ from vla_eval.checkpoints.files import (
     unreadable,
 )
 from vla_eval.errors import CheckpointError
-from vla_eval.strict.json_fields import (
-    FETCH_AGAIN,
-    get_mapping,
-    get_text,
-    read_json,
-    wrong_type,
-)
+from vla_eval.strict.json_fields import FETCH_AGAIN, get_mapping, get_text, read_json, wrong_type
 from vla_eval.strict.json_text import shown
 
 STATE_SUFFIX = ".safetensors"

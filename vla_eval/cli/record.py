@@ -6,13 +6,7 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from vla_eval.cli.shared.arguments import (
-    add_flags,
-    env_paths,
-    read_config,
-    set_flags,
-    typed_command,
-)
+from vla_eval.cli.shared.arguments import add_flags, env_paths, read_config, set_flags, typed_command
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.replaying import replay_each
 from vla_eval.config.dataset import DatasetRecipe, fingerprint

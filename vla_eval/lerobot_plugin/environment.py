@@ -19,15 +19,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.core import StepResult
 from vla_eval.envs.gymnasium_env import TaskEnv, render_settings
 from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
-from vla_eval.features import (
-    ACTION_KEY,
-    CAMERA_KEYS,
-    FPS,
-    STATE_KEY,
-    STATE_NAMES,
-    StateKind,
-    proprioception,
-)
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, FPS, STATE_KEY, STATE_NAMES, StateKind, proprioception
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec

@@ -8,15 +8,7 @@ import numpy as np
 
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
-from vla_eval.probe.quantities import (
-    Pair,
-    Share,
-    SwapQuantities,
-    follows,
-    pair_up,
-    paired_p,
-    swap_quantities,
-)
+from vla_eval.probe.quantities import Pair, Share, SwapQuantities, follows, pair_up, paired_p, swap_quantities
 from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
 from vla_eval.probe.world_records import Records, Worlds, by_policy, chance_of, compared_with, results_of

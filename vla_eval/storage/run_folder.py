@@ -20,13 +20,7 @@ from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device
 from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder
 from vla_eval.storage.episodes_file import parse_records, repair_records, shown_key
-from vla_eval.storage.folders import (
-    EPISODES_FILE,
-    LOCK_FILE,
-    TIMINGS_FILE,
-    check_folder,
-    not_a_run_folder,
-)
+from vla_eval.storage.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, check_folder, not_a_run_folder
 from vla_eval.storage.planned import PlannedEpisodes
 from vla_eval.storage.run_file import (
     DEVICE,

@@ -9,15 +9,7 @@ from pathlib import Path
 
 from vla_eval.errors import MergeError, some_of
 from vla_eval.storage.continuing import device_changes, known_device, without_device
-from vla_eval.storage.run_file import (
-    DEVICE,
-    Change,
-    JsonValue,
-    RunFile,
-    Session,
-    find_changes,
-    listed,
-)
+from vla_eval.storage.run_file import DEVICE, Change, JsonValue, RunFile, Session, find_changes, listed
 from vla_eval.storage.shard import Shard
 
 

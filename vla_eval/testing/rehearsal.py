@@ -17,12 +17,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.checkpoints.files import ADAPTER_CONFIG_FILE, WEIGHTS_FILE, find_checkpoint
-from vla_eval.checkpoints.loading import (
-    LoadOptions,
-    load_checkpoint,
-    make_unfilled_policy,
-    read_config,
-)
+from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint, make_unfilled_policy, read_config
 from vla_eval.checkpoints.policy_types import history
 from vla_eval.checkpoints.verify import random_batch
 from vla_eval.chunking import ChunkingSpec

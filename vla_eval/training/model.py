@@ -15,12 +15,7 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from vla_eval.checkpoints.backbones import WITHOUT, fetched_backbones
 from vla_eval.checkpoints.files import POSTPROCESSOR_FILE, PREPROCESSOR_FILE
 from vla_eval.checkpoints.foreign_code import no_foreign_code
-from vla_eval.checkpoints.loading import (
-    LoadOptions,
-    begin_from,
-    config_class,
-    fill_policy,
-)
+from vla_eval.checkpoints.loading import LoadOptions, begin_from, config_class, fill_policy
 from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly
 from vla_eval.checkpoints.processors import step_names, tokenizer_overrides
 from vla_eval.data.exact_statistics import usable_statistics

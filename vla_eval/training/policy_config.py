@@ -14,12 +14,7 @@ from lerobot.transforms import ImageTransforms, ImageTransformsConfig
 from lerobot.utils.feature_utils import dataset_to_policy_features
 
 from vla_eval.checkpoints.config_check import check_config
-from vla_eval.checkpoints.files import (
-    CONFIG_FILE,
-    POSTPROCESSOR_FILE,
-    PREPROCESSOR_FILE,
-    read_json,
-)
+from vla_eval.checkpoints.files import CONFIG_FILE, POSTPROCESSOR_FILE, PREPROCESSOR_FILE, read_json
 from vla_eval.checkpoints.foreign_code import only_data
 from vla_eval.checkpoints.loading import asked_for, with_local_files
 from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly

@@ -8,12 +8,7 @@ from typing import Any
 
 from vla_eval.checkpoints.files import checkpoint_sha256, file_sha256, find_checkpoint
 from vla_eval.config.files import Recipe, digest_of, list_recipes, to_data
-from vla_eval.config.finetuning import (
-    LOGGERS,
-    FinetuneConfig,
-    FinetuneRecipe,
-    merge_fields,
-)
+from vla_eval.config.finetuning import LOGGERS, FinetuneConfig, FinetuneRecipe, merge_fields
 from vla_eval.config.policy import load_policy
 from vla_eval.data.dataset_folder import require_finished
 from vla_eval.data.facts import KINDS

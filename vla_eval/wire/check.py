@@ -14,16 +14,7 @@ from urllib.parse import urlsplit
 import numpy as np
 
 # Relative: the file is in two packages.
-from .check_client import (
-    CheckFailedError,
-    Chunks,
-    Episode,
-    Facts,
-    RefusedError,
-    Server,
-    run_episodes,
-    shown,
-)
+from .check_client import CheckFailedError, Chunks, Episode, Facts, RefusedError, Server, run_episodes, shown
 from .noise import PAIRS, SEEDS
 
 __all__ = ["CheckFailedError", "check_remote"]

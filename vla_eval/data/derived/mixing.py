@@ -16,11 +16,7 @@ from vla_eval import __version__
 from vla_eval.data.check import require_checked
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.exact_statistics import QUANTILES, vector_statistics
-from vla_eval.data.facts import (
-    DatasetFacts,
-    MixtureFacts,
-    MixtureSource,
-)
+from vla_eval.data.facts import DatasetFacts, MixtureFacts, MixtureSource
 from vla_eval.data.manifest import MIXTURE_FILE, write_entry
 from vla_eval.data.opening import OpenDataset, join_datasets, open_dataset
 from vla_eval.data.tables import read_columns

@@ -13,11 +13,7 @@ import torch
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 from vla_eval.core import ImageArray
-from vla_eval.data.frames.frame_cache import (
-    frame_source,
-    frames_in_ram,
-    frames_on_disk,
-)
+from vla_eval.data.frames.frame_cache import frame_source, frames_in_ram, frames_on_disk
 from vla_eval.data.tables import as_array, holds_numbers
 from vla_eval.errors import DatasetError, check_names
 from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind

@@ -23,13 +23,7 @@ from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.jobs import Origin
 from vla_eval.errors import DatasetError, RunFolderError
 from vla_eval.lock.switch import let_write
-from vla_eval.storage.continuing import (
-    check_allowed,
-    continued,
-    device_changes,
-    known_device,
-    without_device,
-)
+from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device, without_device
 from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder, whole_lines
 from vla_eval.storage.folders import other_files
 from vla_eval.storage.run_file import RUN_FILE, RunDescription, RunFile

@@ -17,13 +17,7 @@ from vla_eval.models.openvla.generation import generated_actions, parallel_actio
 from vla_eval.models.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.models.openvla.prompt import finished
 from vla_eval.models.shared.chunks import PromptedChunks
-from vla_eval.models.shared.images import (
-    Size,
-    augment,
-    centre_crop,
-    resize_lanczos3,
-    truncated_levels,
-)
+from vla_eval.models.shared.images import Size, augment, centre_crop, resize_lanczos3, truncated_levels
 from vla_eval.models.shared.levels import MAX_LEVEL
 from vla_eval.models.shared.precision import default_dtype
 

@@ -10,12 +10,7 @@ from torch.nn import functional
 from vla_eval.features import REWARD_KEY, STATE_KEY, RewardKind
 from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
 from vla_eval.models.episodes.policy import EpisodePolicy
-from vla_eval.models.episodes.samples import (
-    Episodes,
-    goal_missed,
-    stacked_images,
-    weighted_mean,
-)
+from vla_eval.models.episodes.samples import Episodes, goal_missed, stacked_images, weighted_mean
 from vla_eval.models.episodes.sentence import SentenceEncoder, said_at_each_step, with_sentence
 from vla_eval.models.sequence.configuration_sequence import TYPE, MikasaSequenceConfig
 from vla_eval.models.sequence.core import CoreMemory

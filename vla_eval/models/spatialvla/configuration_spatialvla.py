@@ -27,19 +27,8 @@ from vla_eval.models.shared.stages import (
     Stages,
     n_images,
 )
-from vla_eval.models.spatialvla.action_grid import (
-    ActionGrid,
-    fitted_gaussians,
-    gaussian_grid,
-    uniform_grid,
-)
-from vla_eval.models.spatialvla.sizes import (
-    ATTENTIONS,
-    N_ACTION,
-    TOKENS_PER_ACTION,
-    Attention,
-    NetworkSizes,
-)
+from vla_eval.models.spatialvla.action_grid import ActionGrid, fitted_gaussians, gaussian_grid, uniform_grid
+from vla_eval.models.spatialvla.sizes import ATTENTIONS, N_ACTION, TOKENS_PER_ACTION, Attention, NetworkSizes
 from vla_eval.strict.bounds import require
 
 TYPE = "mikasa_spatialvla"

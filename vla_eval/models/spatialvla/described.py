@@ -18,13 +18,7 @@ from vla_eval.models.shared.siglip import LAYER_NORM_EPS
 from vla_eval.models.spatialvla.action_grid import AXES
 from vla_eval.models.spatialvla.depth import zoe_config
 from vla_eval.models.spatialvla.ego3d import CELLS, N_FREQUENCIES
-from vla_eval.models.spatialvla.network import (
-    ATTENTION_CAP,
-    GELU,
-    LOGIT_CAP,
-    RMS_NORM_EPS,
-    ROPE_THETA,
-)
+from vla_eval.models.spatialvla.network import ATTENTION_CAP, GELU, LOGIT_CAP, RMS_NORM_EPS, ROPE_THETA
 from vla_eval.models.spatialvla.sections import OF_NO_EFFECT, Field, Section
 from vla_eval.models.spatialvla.sizes import SLIDING_WINDOW, NetworkSizes
 from vla_eval.strict.json_fields import read_json

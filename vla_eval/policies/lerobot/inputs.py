@@ -18,12 +18,7 @@ from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differe
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
-from vla_eval.features import (
-    STATE_KEY,
-    STATE_NAMES,
-    StateKind,
-    proprioception,
-)
+from vla_eval.features import STATE_KEY, STATE_NAMES, StateKind, proprioception
 from vla_eval.specs import EnvSpec
 
 ACTION_KEY = "action"
