@@ -1,11 +1,8 @@
 """Plain encoders of images: the one of the paper's baselines, and keypoints of shapes and of colours."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
-from typing import (
-    Any,  # torch's context of a function is untyped
-    NamedTuple,
-)
+from typing import Any  # torch's context of a function is untyped
 
 import torch
 from torch import Tensor, nn
@@ -80,17 +77,11 @@ class ShapesAndColors(nn.Module):
         return torch.cat([self.shapes(images), self.colors(images)], dim=1)
 
 
-class FeatureRow(NamedTuple):
-    """Features of each cell of 4 x 4 pixels, and how many maps they are."""
-
-    make: Callable[[], nn.Module]
-    n_maps: int
-
-
-FEATURES = {
-    "keypoints": FeatureRow(_shapes, SHAPE_MAPS),
-    "color_keypoints": FeatureRow(ShapesAndColors, SHAPE_MAPS + COLOR_MAPS),
+FEATURES: Mapping[str, tuple[Callable[[], nn.Module], int]] = {
+    "keypoints": (_shapes, SHAPE_MAPS),
+    "color_keypoints": (ShapesAndColors, SHAPE_MAPS + COLOR_MAPS),
 }
+"""Name -> features of each cell of 4 x 4 pixels, and how many maps they are."""
 
 
 class Keypoints(nn.Module):
