@@ -2,8 +2,9 @@
 
 They are not committed, so they cannot be out of date: the command line from its argparse parsers, the
 tasks from the catalogue, the tables of recipes from the READMEs beside them, the list of modules from their
-first lines, the changelog. The pages `docs/reference/api/*.md` name modules; mkdocstrings fills them from
-docstrings. It knows nothing of how pages look, and imports neither torch nor a simulator.
+first lines, the changelog, the notebooks with their outputs. The pages `docs/reference/api/*.md` name
+modules; mkdocstrings fills them from docstrings. It knows nothing of how pages look, and imports neither
+torch nor a simulator.
 """
 
 import argparse
@@ -14,11 +15,13 @@ import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any  # MkDocs passes what this hook does not use
 from unittest import mock
 
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
+from scripts.notebooks import as_markdown, read
 from vla_eval.cli import show
 from vla_eval.cli.main import PROGRAM, build_parser
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET
@@ -28,6 +31,8 @@ ROOT = Path(__file__).parents[1]
 RECIPE_FOLDERS = ("configs", "policies", "datasets", "prompts", "protocols")
 API_FOLDER = "reference/api"
 DOCUMENTED = re.compile(r"^::: (vla_eval[\w.]*)$", re.MULTILINE)
+NOTEBOOK_LINK = re.compile(r"(\]\([^()\s]+)\.ipynb\)")
+NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 HELP_COLUMNS = "82"  # what the column of a page shows without scrolling
 
 
@@ -38,6 +43,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Lead links to notebooks to their pages."""
+    return NOTEBOOK_LINK.sub(r"\1.md)", markdown)
+
+
 def generated_pages() -> dict[str, str]:
     """Return path in the site -> Markdown."""
     return {
@@ -45,6 +55,7 @@ def generated_pages() -> dict[str, str]:
         "reference/tasks.md": _tasks(),
         f"{API_FOLDER}/rooms.md": _rooms(),
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
+        **{f"notebooks/{file.stem}.md": as_markdown(read(file)) for file in NOTEBOOKS},
         **{f"reference/{folder}.md": _recipes(folder) for folder in RECIPE_FOLDERS},
     }
 

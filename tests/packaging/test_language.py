@@ -1,11 +1,12 @@
 """The text is in the standard terms of the field: a table of words to avoid, and what to say instead.
 
-It reads the Markdown files, the comments of YAML, shell and Make files, and the comments, docstrings and
-messages of the Python files. Names of the code, which stand in `backticks`, may be anything.
+It reads the Markdown files, the notebooks, the comments of YAML, shell and Make files, and the comments,
+docstrings and messages of the Python files. Names of the code, which stand in `backticks`, may be anything.
 """
 
 import ast
 import io
+import json
 import re
 import subprocess
 import tokenize
@@ -118,6 +119,13 @@ def words_of_prose(path: str, source: str) -> Iterator[Line]:
         yield Line(path, number, text)
 
 
+def words_of_notebook(path: str, source: str) -> Iterator[Line]:
+    """Yield what its cells say, without their outputs; the number is that of the cell."""
+    for number, cell in enumerate(json.loads(source)["cells"], 1):
+        words = words_of_prose if cell["cell_type"] == "markdown" else words_of_python
+        yield from (line._replace(number=number) for line in words(path, "".join(cell["source"])))
+
+
 def words_of(path: str) -> Iterator[Line]:
     """Yield what people read in a file."""
     source = (ROOT / path).read_text(encoding="utf-8")
@@ -125,13 +133,15 @@ def words_of(path: str) -> Iterator[Line]:
         yield from words_of_python(path, source)
     elif path.endswith((".md", ".j2")):
         yield from words_of_prose(path, source)
+    elif path.endswith(".ipynb"):
+        yield from words_of_notebook(path, source)
     else:
         yield from words_of_comments(path, source)
 
 
 def files_to_read() -> list[str]:
     """Return the tracked files whose text is ours, without tests and what is exempt."""
-    patterns = ("*.md", "*.j2", "*.yml", "*.yaml", "*.py", "*.sh", "*.toml", "Makefile")
+    patterns = ("*.md", "*.ipynb", "*.j2", "*.yml", "*.yaml", "*.py", "*.sh", "*.toml", "Makefile")
     listed = subprocess.run(
         ["git", "ls-files", "--", *patterns], cwd=ROOT, capture_output=True, text=True, check=True
     )
@@ -182,3 +192,11 @@ def test_a_sentence_before_a_colon_is_read_and_a_name_is_not() -> None:
     docstring = '"""Do it.\n\nWhoever asks: nobody.\n    whoever: a name.\n    first, whoever: two.\n"""\n'
     found = [offence for line in words_of_python("x.py", docstring) for offence in offences(line)]
     assert found == ["x.py:3: 'Whoever': say anyone who, code that"]
+
+
+def test_text_and_code_of_notebooks_are_read_and_outputs_are_not() -> None:
+    text = {"cell_type": "markdown", "source": ["Two pictures."]}
+    code = {"cell_type": "code", "source": ["x = 1  # anew\n"], "outputs": [{"text": ["eyes"]}]}
+    lines = words_of_notebook("x.ipynb", json.dumps({"cells": [text, code]}))
+    found = [offence for line in lines for offence in offences(line)]
+    assert [one.partition(": say")[0] for one in found] == ["x.ipynb:1: 'pictures'", "x.ipynb:2: 'anew'"]

@@ -6,14 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # policies are whatever the user gives; plain data
 
+from markupsafe import Markup
+
 from vla_eval.api.configured import listed
 from vla_eval.api.evaluating import entries_of, eval_config, run_or_resume
-from vla_eval.api.run import Text
+from vla_eval.api.run import Text, in_colors, notebook_html
 from vla_eval.cli.probe import EPISODES, INTERVENTIONS, OUT, probe_settings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.page.retention_plot import write_retention
+from vla_eval.probe.page.sections import retention_plots
 from vla_eval.probe.probe_text import render_probe
 from vla_eval.probe.table import ProbeTable, read_probe
 from vla_eval.results.formats import Format
@@ -39,6 +42,13 @@ class ProbeResult:
 
     def _repr_markdown_(self) -> str:
         return self.table()
+
+    def _repr_html_(self) -> str:
+        """Return table and retention curves, for notebooks."""
+        plots = retention_plots(self.found)
+        legend = [Markup("{} {} &emsp;").format(one.svg, one.name) for one in plots.legend if plots.charts]
+        drawn = in_colors([*legend, *(chart.svg for chart in plots.charts)])
+        return notebook_html(self.table("html-table"), [drawn])
 
 
 def run_probe(

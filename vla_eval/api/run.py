@@ -148,13 +148,20 @@ class Run:
         material = gather(self.stored, baseline=None)
         found = verdicts(material.table)
         said = [Markup("<p><b>{}</b>: {}</p>").format(one.task, " ".join(one.sentences)) for one in found]
-        colors = "; ".join(f"--{name}: {color}" for name, color in PALETTE.items())
         charts = [chart.svg for chart in success_plots(material).charts]
-        table = Markup(render(material.table, "html-table"))
-        # A notebook has none of the page's styles: size of letters and colors of drawings are set here.
-        style = f"font-size: {FONT_SIZE_PX}px; {colors}"
-        plots = Markup('<div style="{}">{}</div>').format(style, Markup("\n").join(charts))
-        return str(Markup("\n").join([table, *said, plots]))
+        return notebook_html(render(material.table, "html-table"), [*said, in_colors(charts)])
+
+
+def notebook_html(table: str, below: Sequence[Markup]) -> str:
+    """Return a result as HTML for a notebook: the table, then sentences and plots."""
+    return str(Markup("\n").join([Markup(table), *below]))
+
+
+def in_colors(drawn: Sequence[Markup]) -> Markup:
+    """Return drawings of the report page as they look there: a notebook has none of its styles."""
+    colors = "; ".join(f"--{name}: {color}" for name, color in PALETTE.items())
+    style = f"font-size: {FONT_SIZE_PX}px; {colors}"
+    return Markup('<div style="{}">{}</div>').format(style, Markup("\n").join(drawn))
 
 
 def load_run(*folders: str | Path) -> Run:

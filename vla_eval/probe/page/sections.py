@@ -47,7 +47,7 @@ def _probe_section(probe: FoundProbe) -> ProbeSection:
         table=printed_probe(table),
         sentences=tuple(sentences(table)),
         notes=(*notes(table), *probe.doubles),
-        plots=_retention_plots(table) if table.retention else None,
+        plots=retention_plots(table) if table.retention else None,
         curves_table=_half_lives(table) if table.retention else None,
         matrices=tuple(map(_matrix, pairs)),
         films=film_pairs(probe.worlds, pairs),
@@ -68,7 +68,7 @@ def _grid_section(probe: FoundProbe) -> ProbeSection:
     )
 
 
-def _retention_plots(table: ProbeTable) -> Plots:
+def retention_plots(table: ProbeTable) -> Plots:
     """Draw the retention curves, one chart per task and kind of curve; delays on a logarithmic axis."""
     colors = line_colors(table.retention)
     legend = (
