@@ -79,3 +79,9 @@ def test_the_stub_has_the_names_that_are_offered() -> None:
 
 def test_names_of_tasks_and_policies_are_listed() -> None:
     assert TASK in vla_eval.list_tasks() and "oracle" in vla_eval.list_policies()
+
+
+def test_only_markdown_is_offered_to_notebooks_as_markdown(run: vla_eval.Run) -> None:
+    assert run.table()._repr_markdown_() == str(run.table())
+    assert run.table("latex")._repr_markdown_() is None  # IPython then shows the text
+    assert repr(run.table("csv")) == str(run.table("csv"))

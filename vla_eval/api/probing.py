@@ -38,7 +38,7 @@ class ProbeResult:
 
     def table(self, format: Format = "markdown") -> Text:
         """Return the table, as `mikasa-vla probe` prints it."""
-        return Text(render_probe(self.found, format))
+        return Text(render_probe(self.found, format), format)
 
     def _repr_markdown_(self) -> str:
         return self.table()

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal  # plain data
+from typing import TYPE_CHECKING, Any, Literal, Self  # plain data
 
 from markupsafe import Markup
 
@@ -29,12 +29,20 @@ FRAMES = ("table", "episodes")
 class Text(str):
     """Text that Python's prompt and notebooks show as it is, not as a string in quotes."""
 
+    written_in: Format
+
+    def __new__(cls, text: str, format: Format) -> Self:
+        """Take the text and what it is written in."""
+        made = super().__new__(cls, text)
+        made.written_in = format
+        return made
+
     def __repr__(self) -> str:
         """Return the text itself."""
         return str(self)
 
-    def _repr_markdown_(self) -> str:
-        return str(self)
+    def _repr_markdown_(self) -> str | None:
+        return str(self) if self.written_in == "markdown" else None
 
 
 class Run:
@@ -85,7 +93,8 @@ class Run:
                 preset=preset,
                 paper=paper,
                 published=published,
-            )
+            ),
+            format,
         )
 
     def to_pandas(self, kind: Literal["table", "episodes"] = "table") -> "pd.DataFrame":
@@ -123,7 +132,7 @@ class Run:
         """
         named = None if reference is None else str(reference)
         sweep = compare_runs(self.stored, by=by, reference=named, difference=difference)
-        return Text(render_sweep(sweep, format))
+        return Text(render_sweep(sweep, format), format)
 
     def page(self, folder: str | Path | None = None, *, baseline: str | None = None) -> Path:
         """Write the report page and return its file; by default in a folder beside the run's.
