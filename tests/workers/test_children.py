@@ -23,6 +23,7 @@ STARTERS = {
 }
 NAMING = {
     "vla_eval/workers/guard.py": "os.fork",  # a fork has its parent's modules
+    "scripts/notebooks.py": "sys.executable",  # a notebook's own process
     "vla_eval/lock/events.py": "sys.executable",  # to know it where a program is refused
 }
 

@@ -106,11 +106,11 @@ def run(args: argparse.Namespace) -> int:
         )
     config, command = _config(args), typed_command()
     if args.dry_run:
-        # Here and not above: `mikasa-vla --help` need not wait for numpy.
-        from vla_eval.training.dry_run import describe_finetuning
         from vla_eval.training.request import look_for
 
-        look_for(config, is_dry=True)
+        look_for(config, is_dry=True)  # before torch is imported
+        from vla_eval.training.dry_run import describe_finetuning
+
         with contextlib.redirect_stdout(sys.stderr), dry_run_options(args) as options:
             lines = describe_finetuning(config, options)
         print("\n".join(lines))
