@@ -11,17 +11,14 @@ from typing import Any
 from vla_eval.cli.shared.arguments import add_old_flag
 from vla_eval.errors import MAX_SHOWN, CheckpointError
 from vla_eval.models.families import FAMILIES, bases
-from vla_eval.models.family import imported
+from vla_eval.models.family import Family, imported
 from vla_eval.models.shared.options import Flag, flags_of
 
-CONVERTED = {f"convert-{family.name}": family for family in FAMILIES.values() if family.converter}
-"""Action -> the family whose published checkpoints it converts."""
-PAGES = [family.docs for family in CONVERTED.values()]
-DESCRIPTION = f"""verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
+DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
 statistics, and let it act once. It says nothing of how good the policy is.
 fetch: get a published base from the Hub, check it, and convert it where needed.
 rehearse: try a recipe at its true size with random weights.
-{", ".join(CONVERTED)}: make a LeRobot checkpoint of an original one. merge: put a
+{}: make a LeRobot checkpoint of an original one. merge: put a
 LoRA adapter into its base. Only fetch downloads anything."""
 FETCH = """Fetch a published checkpoint that recipes start from, check every file, and convert it where
 needed. It shows the licence, and the size and the free disk, before it fetches. The same command again
@@ -32,10 +29,16 @@ seconds and peak memory. The checkpoint is removed afterwards. With the folder o
 is loaded instead, and nothing is written."""
 
 
+def _converted() -> dict[str, Family]:
+    """Return action -> the family whose published checkpoints it converts."""
+    return {f"convert-{family.name}": family for family in FAMILIES.values() if family.converter}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
-    parser.description = DESCRIPTION
-    parser.epilog = f"{', '.join(PAGES[:-1])} and {PAGES[-1]} explain converting."
+    pages = [family.docs for family in _converted().values()]
+    parser.description = DESCRIPTION.format(", ".join(_converted()))
+    parser.epilog = f"{', '.join(pages[:-1])} and {pages[-1]} explain converting."
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     verify = actions.add_parser("verify", help="load it strictly and let it act once", allow_abbrev=False)
     verify.add_argument("path", metavar="PATH", help="a LeRobot checkpoint, or a run of ours")
@@ -47,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_convert(actions: "argparse._SubParsersAction[Any]") -> None:
-    for verb, family in CONVERTED.items():
+    for verb, family in _converted().items():
         convert = actions.add_parser(verb, help="make a LeRobot checkpoint of it", allow_abbrev=False)
         convert.add_argument("path", metavar="PATH", help="folder of the published checkpoint")
         convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
@@ -107,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
         "fetch": _fetch,
         "rehearse": _rehearse,
         "merge": _merge,
-        **dict.fromkeys(CONVERTED, _convert),
+        **dict.fromkeys(_converted(), _convert),
     }
     if args.action != "fetch":
         _look_for(args)
@@ -125,7 +128,7 @@ def _look_for(args: argparse.Namespace) -> None:
 
     if args.action == "rehearse" and not os.path.isdir(args.name):
         load_finetune_recipe(FinetuneConfig(policy=args.name, dataset="none"))
-    elif args.action in CONVERTED:
+    elif args.action in _converted():
         if not os.path.isdir(args.path):
             raise CheckpointError(
                 f"{args.path:.{MAX_SHOWN}}: expected the folder of a published checkpoint, found no such "
@@ -147,7 +150,7 @@ def _verify(args: argparse.Namespace) -> list[str]:
 def _convert(args: argparse.Namespace) -> list[str]:
     from vla_eval.checkpoints.conversion import convert
 
-    family = CONVERTED[args.action]
+    family = _converted()[args.action]
     options = imported(family.convert_options)
     given = {name: _value(args, flag) for name, flag in flags_of(options).items()}
     named = {name: value for name, value in given.items() if value is not None}
