@@ -15,25 +15,25 @@ from typing import Any
 __version__ = "0.1.0"
 
 _PLACES = {
-    "Run": "run",
-    "check_policy": "checking",
-    "evaluate": "evaluating",
-    "finetune": "finetuning",
-    "list_policies": "listing",
-    "list_tasks": "listing",
-    "load_dataset": "recording",
-    "load_run": "run",
-    "make_env": "environments",
-    "record": "recording",
-    "run_probe": "probing",
+    "Run": "vla_eval.api.run",
+    "check_policy": "vla_eval.api.checking",
+    "evaluate": "vla_eval.api.evaluating",
+    "finetune": "vla_eval.api.finetuning",
+    "list_policies": "vla_eval.api.listing",
+    "list_tasks": "vla_eval.api.listing",
+    "load_dataset": "vla_eval.api.recording",
+    "load_run": "vla_eval.api.run",
+    "make_env": "vla_eval.envs.gymnasium_env",
+    "record": "vla_eval.api.recording",
+    "run_probe": "vla_eval.api.probing",
 }
-"""Name -> its module in `vla_eval.api`, imported when it is first asked for; types: `__init__.pyi`."""
+"""Name -> its module, imported when it is first asked for; types: `__init__.pyi`."""
 
 
 def __getattr__(name: str) -> Any:  # Any: a function or a class
     if name not in _PLACES:
         raise AttributeError(f"module 'vla_eval' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"vla_eval.api.{_PLACES[name]}"), name)
+    return getattr(importlib.import_module(_PLACES[name]), name)
 
 
 def __dir__() -> list[str]:

@@ -15,7 +15,8 @@ from vla_eval.config.environment import EnvSettings, RenderSettings, Simulator, 
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE
 from vla_eval.core import EpisodeStart, FloatArray, SimEnv, StepResult
-from vla_eval.envs.factory import describe_env, make_env
+from vla_eval.envs.factory import describe_env
+from vla_eval.envs.factory import make_env as make_sim_env
 from vla_eval.errors import InvalidActionError, TaskArgumentError, check_names, unknown_name
 from vla_eval.features import FPS, IMAGE_SIZE_PX
 from vla_eval.tasks.catalog import task_spec
@@ -94,7 +95,7 @@ class TaskEnv(gym.Env[dict[str, Any], NDArray[Any]]):
         super().reset(seed=seed)
         drawn = int(self.np_random.integers(2**31)) if seed is None else self._seed_of(seed)
         if self._env is None:
-            self._env = make_env(self._settings)
+            self._env = make_sim_env(self._settings)
         self._result = result = self._env.reset({SLOT: drawn}, render=bool(self._settings.cameras))[SLOT]
         self._episode = replace(self._next, seed=drawn).worded(result.wording)
         return self._observation(result), self._info(result)
@@ -162,7 +163,7 @@ class TaskEnv(gym.Env[dict[str, Any], NDArray[Any]]):
         return numbers
 
 
-def make_task_env(
+def make_env(
     task: str,
     *,
     control_mode: str = EE_DELTA_POSE,
@@ -175,7 +176,24 @@ def make_task_env(
     render_backend: str = "auto",
     **env: Any,
 ) -> TaskEnv:
-    """Return the environment of a task; see `vla_eval.make_env`."""
+    """Return a task's environment: what `gymnasium.make("vla_eval/TASK", …)` makes, without its wrappers.
+
+    Args:
+        task: task id, a family with the arguments that it asks for, or a task of an installed package.
+        control_mode: what an action means.
+        image_size: height and width of images.
+        cameras: which images an observation has; none: no renderer is started.
+        prompt_set: where the instruction comes from.
+        render_mode: `rgb_array`, or None.
+        simulator: `fake` has no physics.
+        wrist_mesh: see `RenderSettings`.
+        render_backend: likewise.
+        **env: arguments of the task, `horizon_steps` among them, as `--set env.NAME` of an evaluation.
+
+    Raises:
+        TaskArgumentError: the task does not take these arguments.
+        UnknownNameError: there is no such task, argument, camera or control mode.
+    """
     row = task_spec(task)
     _refuse_maniskill(row, {**env, "render_backend": render_backend})
     check_names("camera", cameras, CAMERA_NAMES, where=row.id)
@@ -198,9 +216,8 @@ def _refuse_maniskill(row: TaskSpec, given: Mapping[str, Any]) -> None:
         raise TaskArgumentError(
             f"{row.gym_id}: {', '.join(found)}: this environment runs one episode at a time, in numpy, as an "
             f"evaluation does. ManiSkill's own environment (batched, torch) takes these arguments: "
-            f'gymnasium.make("{row.maniskill_id}", …). Several episodes on a CPU: '
-            f'gymnasium.make_vec("{row.gym_id}", num_envs=2, vectorization_mode="async", '
-            'vector_kwargs={"context": "spawn"}). See docs/gymnasium.md.'
+            f'gymnasium.make("{row.maniskill_id}", …). Several episodes on a CPU: {row.make_vec(n_envs=2)}. '
+            "See docs/gymnasium.md."
         )
 
 

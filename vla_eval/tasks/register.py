@@ -17,7 +17,7 @@ from vla_eval.errors import MissingDependencyError
 from vla_eval.tasks.catalog import TASKS
 from vla_eval.tasks.spec import TaskSpec
 
-MAKE = "vla_eval.envs.gymnasium_env:make_task_env"
+MAKE = "vla_eval.envs.gymnasium_env:make_env"
 """Text, as Gymnasium imports it when it is first called: tasks know nothing of what runs them."""
 
 
@@ -47,8 +47,7 @@ def _make_maniskill(spec: TaskSpec, **arguments: Any) -> Any:
     if n_envs > 1 and not torch.cuda.is_available():
         raise MissingDependencyError(
             f"{spec.maniskill_id}: num_envs={n_envs}: several episodes in one environment need a GPU, and "
-            f'none was found. On a CPU: gymnasium.make_vec("{spec.gym_id}", num_envs={n_envs}, '
-            'vectorization_mode="async", vector_kwargs={"context": "spawn"}). See docs/gymnasium.md.'
+            f"none was found. On a CPU: {spec.make_vec(n_envs=n_envs)}. See docs/gymnasium.md."
         )
     return registration.make(spec.maniskill_id, **arguments)
 

@@ -119,6 +119,13 @@ class TaskSpec:
         """The id of the ManiSkill environment behind it: batched, torch."""
         return f"vla_eval_maniskill/{self.id}"
 
+    def make_vec(self, *, n_envs: int) -> str:
+        """Return the call that makes several environments on a CPU, for messages."""
+        return (
+            f'gymnasium.make_vec("{self.gym_id}", num_envs={n_envs}, vectorization_mode="async", '
+            'vector_kwargs={"context": "spawn"})'
+        )
+
     @property
     def has_candidates(self) -> bool:
         """Whether one or more of N objects have to be chosen, and which they are is known to controls."""
