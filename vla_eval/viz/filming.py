@@ -6,7 +6,7 @@ import numpy as np
 
 from vla_eval.core import SimEnv, Stage, StepResult
 from vla_eval.errors import ViewingError
-from vla_eval.viz.tape import EpisodeTape, TapedStep
+from vla_eval.viz.tape import EpisodeTape, Tapes
 
 
 def film_again(
@@ -22,15 +22,17 @@ def film_again(
     Raises:
         ViewingError: the same actions gave another episode.
     """
-    filmed = EpisodeTape(start=tape.start, frame_stride=tape.frame_stride, chunks=tape.chunks)
+    film = Tapes({tape.start.slot}, frame_stride=tape.frame_stride)
     for one in tape.steps:
         if one.action is None:
             heartbeat("reset")
             result = env.reset({0: tape.start.seed}, render=True)[0]
+            film.on_reset(tape.start, result)
         else:
             heartbeat("step")
-            is_due = one.step % tape.frame_stride == 0 or one.step == tape.start.horizon_steps
-            result = env.step({0: one.action}, render=frozenset({0} if is_due else ()))[0]
+            render = frozenset({0} if film.wants_images(one.step) else ())
+            result = env.step({0: one.action}, render=render)[0]
+            film.on_step(tape.start, one.action, result)
         if not _is_same(one.result, result):
             raise ViewingError(
                 f"{tape.start.task}, run {tape.start.run}, seed {tape.start.seed}: run again with the same "
@@ -38,7 +40,8 @@ def film_again(
                 "simulator does not repeat an episode. Capture it while it runs: `all`, or a number of "
                 "episodes, for --capture-video or --capture-rrd."
             )
-        filmed.steps.append(TapedStep(step=one.step, action=one.action, result=result))
+    filmed = film.episodes[tape.start.slot]
+    filmed.chunks = tape.chunks
     return filmed
 
 
