@@ -140,6 +140,10 @@ class ConformanceError(VlaEvalError):
     """An environment, a policy or a task breaks a promise of its contract (`vla_eval.testing`)."""
 
 
+NOT_SET = 'If a shell variable stands there, it is not set, or empty: `echo "$NAME"` shows it.'
+"""What may be wrong where text is empty."""
+
+
 def some_of(items: Iterable[object]) -> str:
     """Return the first items of a list, with commas, and how many more there are."""
     names = [str(item) for item in items]

@@ -13,11 +13,11 @@ from typing import NamedTuple
 from vla_eval.cli.terminal.screen import filled
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import Folder, list_recipes, load_recipe, recipe_fields
+from vla_eval.config.files import Folder, list_recipes, load_recipe, no_such_path, recipe_fields
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.config.protocol import Protocol
-from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, some_of, unknown_name
+from vla_eval.errors import RecipeError, some_of, unknown_name
 from vla_eval.evaluation.model_table import ModelTable, is_model_table
 from vla_eval.tasks.catalog import FAMILIES, TASKS, find_task, installed_tasks, task_spec
 from vla_eval.tasks.source import TaskArgument, task_arguments
@@ -110,10 +110,7 @@ def _show_recipes(name: str) -> int:
     kinds = [kind for kind in KINDS if folder in ("", kind)]
     found = [kind for kind in kinds if stem in list_recipes(kind)]
     if not found and os.sep in name and not kinds:
-        raise UnknownNameError(
-            f"{name:.{MAX_SHOWN}}: there is no such file or folder in {Path.cwd()}. Expected one, or a name "
-            "of `mikasa-vla list`."
-        )
+        raise no_such_path(name, "mikasa-vla list")
     if not found:
         known = [one for kind in KINDS for one in list_recipes(kind)]
         raise unknown_name(

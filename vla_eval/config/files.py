@@ -79,11 +79,16 @@ def find_recipe(folder: Folder, name: str) -> Path:
     if stem in known:
         return known[stem]
     if "/" in stem or (as_path.suffix in (".yaml", ".yml") and not did_you_mean(stem, known)):
-        raise UnknownNameError(
-            f"{name:.{MAX_SHOWN}}: there is no such file or folder in {Path.cwd()}. Expected the path "
-            f"of one, or a name of `mikasa-vla list {folder}`."
-        )
+        raise no_such_path(name, f"mikasa-vla list {folder}")
     raise unknown_name(f"{folder}/*.yaml", name, known)
+
+
+def no_such_path(name: str, command: str) -> UnknownNameError:
+    """Build the error for a path to nothing, with the command that lists names."""
+    return UnknownNameError(
+        f"{name:.{MAX_SHOWN}}: there is no such file or folder in {Path.cwd()}. Expected the path of one, or "
+        f"a name of `{command}`."
+    )
 
 
 def load_recipe[T](

@@ -13,7 +13,7 @@ from vla_eval.checkpoints.bases import hub_folder
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.config.files import Recipe
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.errors import RecipeError
+from vla_eval.errors import NOT_SET, RecipeError
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.policies.remote.survey import survey, survey_address
@@ -99,8 +99,8 @@ def _refuse_empty(text: str) -> None:
     name, equals, folders = text.partition("=")
     if equals and not all(folders.split(",")) and not os.path.exists(text):
         raise RecipeError(
-            f"policies: {text}: expected a folder with a checkpoint after '{name}=', found empty text. If a "
-            'shell variable stands there, it is not set, or empty: `echo "$NAME"` shows it.'
+            f"policies: {text}: expected a folder with a checkpoint after '{name}=', found empty text. "
+            f"{NOT_SET}"
         )
 
 

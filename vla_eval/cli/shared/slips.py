@@ -3,7 +3,7 @@
 import argparse
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
-from vla_eval.errors import did_you_mean
+from vla_eval.errors import NOT_SET, did_you_mean
 
 MEANT: Mapping[str, Sequence[str]] = {
     "--seed": ("--seed-start", "--seeds", "--run-seed"),
@@ -93,10 +93,7 @@ def about_empty(arguments: Sequence[str]) -> str | None:
         if (text == "" or (is_flag and equals and not value)) and flag != "--set":
             before = [one for one in arguments[:index] if one.startswith("--")]
             name = flag if is_flag else before[-1] if before else "an argument"
-            return (
-                f"{name}: expected a value, found empty text. If a shell variable stands there, it is not "
-                'set, or empty: `echo "$NAME"` shows it.'
-            )
+            return f"{name}: expected a value, found empty text. {NOT_SET}"
     return None
 
 
