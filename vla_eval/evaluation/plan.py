@@ -120,6 +120,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     groups, left_out = _groups_of_all(
         config, tasks, policies, prompts=prompts, servers=servers, shared=shared
     )
+    _check_chunks(config, policies)
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
     _refuse_too_many(config, groups)
@@ -275,6 +276,22 @@ def _check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
             )
 
 
+def _check_chunks(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
+    """Refuse a policy without weights, and more action steps than a checkpoint or server predicts at once."""
+    for policy in policies:
+        for recipe in policy.recipes:
+            known = known_chunk_size(recipe.value.adapter, recipe.value.args, recipe=recipe.name)
+            chunk_size = known if policy.server is None else policy.server.chunk_size
+            if chunk_size is None:
+                continue
+            for n_action_steps in _steps(config, policy):
+                config.chunking.at(n_action_steps).check_chunk_size(chunk_size, policy=policy.name)
+
+
+def _steps(config: EvalConfig, policy: PolicyEntry) -> tuple[int, ...]:
+    return config.n_action_steps or (policy.value.default_n_action_steps,)
+
+
 def _runs(config: EvalConfig, group: EpisodeGroup) -> Sequence[int]:
     return range(config.runs) if group.checkpoint is None else (group.checkpoint,)
 
@@ -335,24 +352,18 @@ def _groups(
     *,
     n_rows: int,
 ) -> Iterable[EpisodeGroup]:
-    steps = config.n_action_steps or (policy.value.default_n_action_steps,)
-    for n_action_steps, (index, recipe) in product(steps, enumerate(policy.recipes)):
+    for n_action_steps, (index, recipe) in product(_steps(config, policy), enumerate(policy.recipes)):
         args = recipe.value.args
-        chunking = config.chunking.at(n_action_steps)
-        chunk_size = known_chunk_size(recipe.value.adapter, args, recipe=recipe.name)
         if server is not None:
-            chunk_size = server.chunk_size
             args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare
             n_rows = server.batch_max or n_rows
-        if chunk_size is not None:
-            chunking.check_chunk_size(chunk_size, policy=policy.name)
         yield EpisodeGroup(
             key=GroupKey(task.id, policy.name, n_action_steps),
             adapter=recipe.value.adapter,
             args=args,
             env=_env_settings(config, task),
             rollout=RolloutSettings(
-                chunking=chunking,
+                chunking=config.chunking.at(n_action_steps),
                 eager_rendering=config.eager_rendering,
                 stop_at_success=config.stop_at_success,
                 reset_policy_at_step=config.reset_policy_at_step,
