@@ -143,18 +143,36 @@ def load_text(load: Load, *, n_open: int) -> str:
     return f"{machines}{gpu}, {max(0, n_open - load.n_running)} episodes in the queue"
 
 
-class Progress(EvaluationObserver):
+class _BarAndLines[L: EvaluationLines | PhaseLines]:
+    """A bar for people and lines for other programs, side by side."""
+
+    def __init__(self, stop: StopRequest, lines: L, *, is_quiet: bool) -> None:
+        self._stop = stop
+        self._lines = lines
+        self._bar = EpisodeBar(is_quiet=is_quiet)
+
+    def on_tick(self) -> bool:
+        """Write a line now and then; return whether a signal has asked to stop."""
+        self._bar.tick()
+        self._lines.on_tick()
+        return self._stop.is_asked
+
+    def close(self) -> None:
+        """Write how far it has come."""
+        self._bar.close()
+        self._lines.close(stopped=self._stop.is_asked)
+
+
+class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
     """Shows an evaluation on standard error."""
 
     def __init__(
         self, stop: StopRequest, *, out: Path, capture: CaptureConfig, json_progress: int | None = None
     ) -> None:
         lines = JsonLines(json_progress)
-        self._stop = stop
+        super().__init__(stop, EvaluationLines(lines, out=out), is_quiet=lines.is_stderr)
         self._capture = capture
         self._out = out
-        self._bar = EpisodeBar(is_quiet=lines.is_stderr)
-        self._lines = EvaluationLines(lines, out=out)
         self._n_total = self._n_done = self._n_errors = 0
         self._successes: dict[str, list[bool]] = {}  # policy -> of each episode that ran now
 
@@ -209,26 +227,13 @@ class Progress(EvaluationObserver):
         self._lines.on_load(load)
         self._bar.load(load_text(load, n_open=self._n_total - self._n_done), n_steps=load.n_counted)
 
-    def on_tick(self) -> bool:
-        """Write a line now and then; return whether a signal has asked to stop."""
-        self._bar.tick()
-        self._lines.on_tick()
-        return self._stop.is_asked
 
-    def close(self) -> None:
-        """Write how far it has come."""
-        self._bar.close()
-        self._lines.close(stopped=self._stop.is_asked)
-
-
-class RecordingProgress:
+class RecordingProgress(_BarAndLines[PhaseLines]):
     """A `RecordingObserver`; all but mismatches goes to standard error."""
 
     def __init__(self, stop: StopRequest, *, json_progress: int | None = None) -> None:
         lines = JsonLines(json_progress)
-        self._stop = stop
-        self._bar = EpisodeBar(is_quiet=lines.is_stderr)
-        self._lines = PhaseLines(lines)
+        super().__init__(stop, PhaseLines(lines), is_quiet=lines.is_stderr)
 
     def say(self, sentence: str) -> None:
         """Write a sentence to standard error."""
@@ -248,14 +253,3 @@ class RecordingProgress:
         """Print it: it is what the command is for."""
         self._lines.on_mismatch(sentence)
         tqdm.write(sentence, file=sys.stdout)
-
-    def on_tick(self) -> bool:
-        """Write a line now and then; return whether a signal has asked to stop."""
-        self._bar.tick()
-        self._lines.on_tick()
-        return self._stop.is_asked
-
-    def close(self) -> None:
-        """Write how far the phase has come."""
-        self._bar.close()
-        self._lines.close(stopped=self._stop.is_asked)
