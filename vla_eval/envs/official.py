@@ -11,10 +11,7 @@ import importlib
 import re
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import (
-    Any,  # ManiSkill and the package are untyped: environments, infos are Any here
-    NamedTuple,  # ManiSkill and the package are untyped: environments are Any here
-)
+from typing import Any, NamedTuple  # ManiSkill and the package are untyped: environments, infos are Any here
 
 import numpy as np
 import torch
