@@ -4,6 +4,7 @@ The functions of the scripts are sourced and called; what they ask of the system
 functions, so nothing is installed here.
 """
 
+import shlex
 import shutil
 import subprocess
 import sys
@@ -357,7 +358,7 @@ def test_an_environment_behind_a_link_is_not_cleared(tmp_path: Path) -> None:
     (other / "kept").touch()
     (tmp_path / ".venv").symlink_to(other)
     enough_room = "df() { printf 'a b c 99999999\\n%.0s' 1 2; }"
-    done = shell(f"cd {tmp_path}\nPYTHON={sys.executable}\n{enough_room}\nmake_venv")
+    done = shell(f"cd {tmp_path}\nPYTHON={shlex.quote(sys.executable)}\n{enough_room}\nmake_venv")
     assert done.returncode == 1
     assert f".venv is a link to {other.resolve()}" in done.stderr
     assert (other / "kept").exists()
