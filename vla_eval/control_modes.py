@@ -72,11 +72,7 @@ CONTROL_MODES: Mapping[str, ActionSpec] = MappingProxyType(
 
 
 def action_spec(mode: str) -> ActionSpec:
-    """Return what an action of a mode is.
-
-    Raises:
-        UnknownNameError: there is no such mode.
-    """
+    """Return what an action of a mode is."""
     if mode not in CONTROL_MODES:
         raise unknown_name("control mode", mode, CONTROL_MODES, where=f"env.{CONTROL_MODE}")
     return CONTROL_MODES[mode]

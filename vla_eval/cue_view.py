@@ -64,11 +64,7 @@ AS_SHOWN = CueViewSettings()
 
 
 def cue_locator(env: SimEnv, settings: CueViewSettings, cameras: Sequence[str]) -> Callable[[int], CueBoxes]:
-    """Return where the cue of a slot is in the images that a policy reads.
-
-    Raises:
-        SpecMismatchError: a view hides it, and the environment cannot locate it.
-    """
+    """Return where the cue of a slot is in the images that a policy reads."""
     if not settings.hides or not cameras:
         return lambda _slot: {}
     if isinstance(env, CueLocator):
@@ -109,11 +105,7 @@ class CueView:
         return ObservationWindow(slot=slot, frames=tuple(frame.as_declared(spec) for frame in read))
 
     def seen(self, observation: Observation, phase: Phase | None) -> Observation:
-        """Return what the policy is given in place of an observation; each step once.
-
-        Raises:
-            TaskArgumentError: the cue takes so much of an image that as much is not there elsewhere.
-        """
+        """Return what the policy is given in place of an observation; each step once."""
         kind = self.settings.kind
         in_cue = phase == "cue" and observation.step >= self.settings.begins_at
         if kind == "as_shown" or not (in_cue or phase == "delay"):

@@ -53,16 +53,7 @@ class EpisodeLog:
         self.n_frames += n_frames
 
     def note_step(self, action: FloatArray, result: StepResult, action_spec: ActionSpec) -> None:
-        """Account for one control step.
-
-        Args:
-            action: (A,) the action asked for.
-            result: what came back.
-            action_spec: its bounds; an action beyond them counts as clipped.
-
-        Raises:
-            SimulationError: reward or a state is not finite.
-        """
+        """Account for one control step by the action (A,) asked for and its result."""
         self.n_steps += 1
         self._check_finite(result)
         self.status = result.status
@@ -75,11 +66,7 @@ class EpisodeLog:
             self.success_step = self.n_steps
 
     def is_over(self, *, steps_after_success: int | None) -> bool:
-        """Whether the episode ends here.
-
-        Args:
-            steps_after_success: it ends so many steps after the first success; None: success does not end it.
-        """
+        """Whether the episode ends here, so many steps after its first success (None: never for that)."""
         is_won = (
             steps_after_success is not None
             and self.success_step is not None
@@ -88,13 +75,7 @@ class EpisodeLog:
         return is_won or self.status.fail or self.n_steps >= self.start.horizon_steps
 
     def record(self, policy: str, n_action_steps: int, *, stops_at_success: bool) -> EpisodeRecord:
-        """Return the record of the finished episode.
-
-        Args:
-            policy: the policy's name.
-            n_action_steps: actions executed per inference.
-            stops_at_success: the episode ended at its first success, so the end is not known.
-        """
+        """Return the record of the finished episode; one that stops at its first success has no known end."""
         status, succeeded = self.status, self.success_step is not None
         has_candidates = status.n_candidates > 0
         return EpisodeRecord(
@@ -152,12 +133,7 @@ class EpisodeLog:
 
 
 def check_start(episode: EpisodeStart, chunking: ChunkingSpec) -> None:
-    """Raise unless the episode can begin.
-
-    Raises:
-        MissingInstructionError: there is no instruction for the policy.
-        SpecMismatchError: the policy would never be asked.
-    """
+    """Raise unless the episode can begin."""
     if not episode.instruction.strip():
         raise MissingInstructionError(
             f"{episode.task}, seed {episode.seed}: the instruction is empty. Give it one in prompts/."
@@ -181,13 +157,7 @@ def check_chunk(chunk: object, spec: PolicySpec, action_spec: ActionSpec, log: E
 
 
 def chunk_problem(chunk: object, *, chunk_size: int, dims: Sequence[str]) -> str | None:
-    """Return why a policy's answer is not a chunk of actions; None if it is one.
-
-    Args:
-        chunk: what the policy returned.
-        chunk_size: how many actions it declares.
-        dims: names of an action's numbers.
-    """
+    """Return why a policy's answer is not a chunk of `chunk_size` actions; None if it is one."""
     if not isinstance(chunk, ActionChunk) or not isinstance(chunk.actions, np.ndarray):
         found = f"{type(chunk).__name__}"
     elif chunk.actions.shape != (chunk_size, len(dims)):

@@ -70,13 +70,7 @@ def dataset_features(
     action_names: tuple[str, ...] = ACTION_NAMES,
     image_size_px: int = IMAGE_SIZE_PX,
 ) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data
-    """Return the fields of a dataset as `LeRobotDataset.create(features=…)` takes them.
-
-    Args:
-        state: which proprioception `observation.state` is.
-        action_names: the numbers of an action.
-        image_size_px: height and width of images.
-    """
+    """Return the fields of a dataset as `LeRobotDataset.create(features=…)` takes them."""
 
     def vector(names: tuple[str, ...]) -> dict[str, Any]:  # Any: as above
         return {"dtype": "float32", "shape": (len(names),), "names": list(names)}
@@ -105,9 +99,6 @@ def proprioception(state: Mapping[str, FloatArray]) -> dict[StateKind, FloatArra
 
     Returns:
         `eef` (10,) and `joints` (25,), float32; see `STATE_NAMES`.
-
-    Raises:
-        SpecMismatchError: the joints are another arm's than the Panda's.
     """
     pose, qpos, qvel = state["tcp_pose"], state["qpos"], state["qvel"]
     if len(qpos) != len(JOINT_NAMES):
@@ -139,12 +130,7 @@ def frame_values(
 ) -> dict[str, Any]:  # Any: arrays of several types
     """Return one frame as `LeRobotDataset.add_frame` takes it, without the task string.
 
-    Args:
-        before: what was observed before the action; it has images of all cameras.
-        after: the result of the action.
-        action: (A,) the action to store.
-        state: which proprioception `observation.state` is.
-        is_last: whether this is the last frame of the episode.
+    `before` has images of all cameras, `action` (A,) is what is stored and `after` what it led to.
     """
     kinds = proprioception(before.observation.state)
     return {

@@ -19,14 +19,10 @@ CURSOR_UP = re.compile(r"\n*(\x1b\[A)+")  # how tqdm goes back to a bar that is 
 
 
 def printable(text: str, *, keep: str = "") -> str:
-    """Return the text with an escape for each character that is not printed as a sign or a space.
+    """Return the text with an escape for each character, but those of `keep`, that is not printed as itself.
 
     These are the control characters (C0, DEL, C1), line separators, signs that change the direction of
     writing or are invisible, halves of characters, and what Unicode has not assigned.
-
-    Args:
-        text: any text.
-        keep: characters that are left.
     """
     rest = text
     for letter in keep:

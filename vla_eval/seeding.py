@@ -55,16 +55,7 @@ def seed_ranges(seeds: Iterable[int]) -> tuple[SeedRange, ...]:
 
 
 def generator(seed: int, stream: Stream, *extra: int) -> np.random.Generator:
-    """Return a fresh generator for one purpose of one episode.
-
-    Args:
-        seed: the episode's seed, ≥ 0.
-        stream: the purpose.
-        extra: further numbers that tell draws of one purpose apart, such as the run index.
-
-    Returns:
-        A PCG64 generator; the same arguments always give the same draws.
-    """
+    """Return a fresh generator (PCG64) for one purpose of one episode; `extra`: further numbers of it."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence(seed, spawn_key=(stream, *extra))))
 
 

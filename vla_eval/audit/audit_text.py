@@ -13,11 +13,7 @@ NOT_PLAYED = "–"
 
 
 def render_audit(audits: Sequence[TaskAudit], style: str) -> str:
-    """Return the audit as `markdown` or `json`.
-
-    In Markdown a cell holds success once, in percent, and after a slash the first choices if there are
-    candidates. JSON has every count.
-    """
+    """Return the audit as `json`, with every count, or as `markdown`."""
     if style == "json":
         return json.dumps([asdict(audit) for audit in audits], indent=2)
     columns = [control for control in COLUMNS if any(control in audit.counts for audit in audits)]

@@ -38,10 +38,7 @@ Their metric is success at any step, so that an episode may end there."""
 
 
 def kind_of(task: TaskSpec) -> Kind:
-    """Return whether the task has one right candidate, several, or none; if none, what one frame shows.
-
-    Of an official task with one, also whether its cue can be gone to, or stored by the arm.
-    """
+    """Return whether the task has one right candidate, several, or none; if none, what one frame shows."""
     if not task.oracle:
         return "unscripted"
     if task.is_official and task.has_candidates:

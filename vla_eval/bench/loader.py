@@ -47,8 +47,7 @@ class LoaderReport:
 def run_loader_bench(root: Path | None, *, n_samples: int, repeats: int) -> LoaderReport:
     """Measure random access with chunks of eight actions; the lowest of `repeats` times counts.
 
-    Decoded frames go to a folder that is deleted again, so that decoding is part of what is measured. Without
-    a dataset a synthetic one is measured.
+    Decoded frames go to a folder that is deleted again; without a dataset a synthetic one is measured.
     """
     with tempfile.TemporaryDirectory() as scratch:
         if root is None:

@@ -24,11 +24,7 @@ FOLDER = Path("checkpoints")
 
 
 def hub_folder(name: str) -> Path | None:
-    """Return where `hub:OWNER/NAME@REVISION` lies once it is fetched; None for another name.
-
-    Raises:
-        RecipeError: it begins so and is no such name.
-    """
+    """Return where `hub:OWNER/NAME@REVISION` lies once it is fetched; None for another name."""
     if not name.startswith(HUB):
         return None
     match = _HUB_ID.fullmatch(name)
@@ -66,12 +62,7 @@ def base_of_recipe(recipe: str) -> str | None:
 
 
 def find_base(name: str) -> Base:
-    """Return a base by the name of its folder or of a recipe, or what a Hub id names.
-
-    Raises:
-        UnknownNameError: there is no such base or recipe.
-        RecipeError, CheckpointError: it is no Hub id, or what is there is known to be no LeRobot checkpoint.
-    """
+    """Return a base by the name of its folder or of a recipe, or what a Hub id names."""
     if (folder := hub_folder(name)) is not None:
         return _of_hub(name, folder)
     known = bases()

@@ -23,10 +23,7 @@ Guard = Callable[..., Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Door:
-    """A function or `Class.method` that is not what it was while a checkpoint is open, and its guard.
-
-    It is also replaced in every module that has imported it.
-    """
+    """A function or `Class.method` and its guard; replaced in every module that has imported it."""
 
     module: str
     name: str

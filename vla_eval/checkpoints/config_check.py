@@ -24,10 +24,7 @@ COUNTS = ("chunk_size", "n_action_steps", "horizon", "n_obs_steps", "window_step
 
 
 def check_config(cls: type, data: Mapping[str, Any], *, where: str) -> None:
-    """Compare the types of a file's fields, without `type`, with those of lerobot's class, exactly.
-
-    Fields that the class does not have are left to lerobot.
-    """
+    """Compare the types of a file's fields, without `type`, with those of lerobot's class, exactly."""
     hints = get_type_hints(cls)
     for field in dataclasses.fields(cls):
         if field.name not in data:

@@ -119,11 +119,7 @@ NOT_COPIED = (ADAPTER_CONFIG_FILE, ADAPTER_WEIGHTS_FILE, "README.md", "train_con
 
 
 def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None) -> Path:
-    """Write a checkpoint `out` whose weights are base plus adapter; return it.
-
-    Sums are made in the precision of the base: in bfloat16 the actions differ by its rounding. Without
-    `base_checkpoint`, the base is where it was in training.
-    """
+    """Write a checkpoint `out` whose weights are base plus adapter, in the base's precision; return it."""
     folder = find_checkpoint(path)
     if not (folder / ADAPTER_CONFIG_FILE).is_file():
         raise CheckpointError(f"{folder}: expected a LoRA adapter, found no LoRA adapter but a whole model.")

@@ -53,10 +53,7 @@ def without_execution(data: Mapping[str, Any]) -> dict[str, Any]:
 def ignored_fields(
     adapter: str, args: Mapping[str, Any], *, chunking: ChunkingSpec | None = None
 ) -> tuple[str, ...]:
-    """Return a sentence for each field of a policy's checkpoint that asks for what is not done here.
-
-    The policy is given by a recipe's adapter and args. Without `chunking`, it is the client's.
-    """
+    """Return a sentence for each field of a policy's checkpoint that asks for what is not done here."""
     folder = checkpoint_folder(adapter, args)
     if folder is None:
         return ()

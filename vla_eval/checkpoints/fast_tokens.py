@@ -27,13 +27,7 @@ CLASS = "UniversalActionProcessor"
 
 
 class FastActionTokenizer:
-    """Tokens of normalised actions, and what lerobot needs to turn them back.
-
-    Attributes:
-        bpe_tokenizer: of strings of characters.
-        scale: coefficients are multiplied by it before they are rounded.
-        min_token: the coefficient whose character is 0; lower ones are raised to it.
-    """
+    """Tokens of normalised actions; coefficients below `min_token`, the first character, become it."""
 
     def __init__(self, bpe_tokenizer: Any, *, scale: float, min_token: int) -> None:
         self.bpe_tokenizer, self.scale, self.min_token = bpe_tokenizer, scale, min_token

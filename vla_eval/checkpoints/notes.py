@@ -55,11 +55,7 @@ def checkpoint_folder(adapter: str, args: Mapping[str, Any]) -> Path | None:
 
 
 def known_chunk_size(adapter: str, args: Mapping[str, Any], *, recipe: str) -> int | None:
-    """Return how many actions a policy predicts at once; None where only the loaded policy knows that.
-
-    Raises:
-        CheckpointError: a policy that is trained has no weights.
-    """
+    """Return how many actions a policy predicts at once; None where only the loaded policy knows that."""
     if adapter in LEROBOT_CHECKPOINTS and args.get("checkpoint") is None:
         raise no_weights(recipe)
     _check_names(adapter, args, policy=recipe)
@@ -76,13 +72,7 @@ def known_chunk_size(adapter: str, args: Mapping[str, Any], *, recipe: str) -> i
 def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> dict[str, str]:
     """Return digests of all that the weights of a recipe's policy consist of, and of their training data.
 
-    Returns:
-        `checkpoints/POLICY`, `checkpoints/POLICY/base`, `datasets/NAME` -> sha256; empty for a policy
-        without weights, or whose adapter is another package's.
-
-    Raises:
-        CheckpointError: the weights are not there.
-        RecipeError: an argument that names a folder is not text.
+    Keys: `checkpoints/POLICY`, `checkpoints/POLICY/base`, `datasets/NAME`; none for a policy without weights.
     """
     _check_names(adapter, args, policy=policy)
     folder = checkpoint_folder(adapter, args)
@@ -101,10 +91,8 @@ def checkpoint_hashes(adapter: str, args: Mapping[str, Any], *, policy: str) -> 
 def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]:
     """Return by which statistics a policy, of a recipe's adapter and args, normalises and un-normalises.
 
-    Returns:
-        `of`: the dataset whose statistics they are, by its name, or `the checkpoint` where that is not
-        known. `before` and `after` the policy: field -> statistic -> one number per dimension; only what
-        is used. Empty for a policy without a checkpoint of LeRobot's.
+    `of`: the dataset whose statistics they are, or `the checkpoint`. `before` and `after` the policy: field
+    -> statistic -> numbers. Empty for a policy without a checkpoint of LeRobot's.
     """
     folder = checkpoint_folder(adapter, args)
     if folder is None:

@@ -29,10 +29,7 @@ def plain_errors(where: Path | str, kind: str, what: str) -> Iterator[None]:
 
 
 def raise_plainly(exc: ImportError | OSError | RuntimeError, config: Any) -> NoReturn:
-    """Say which package or file is missing, if that made `exc`; raise `exc` again if it was something else.
-
-    `config` is the policy's, or its type and fields. transformers raises `OSError` for a missing file.
-    """
+    """Say which package or file is missing, if that made `exc`; otherwise raise `exc` again."""
     if isinstance(exc.__cause__, VlaEvalError):
         raise exc.__cause__
     if isinstance(exc, ImportError):

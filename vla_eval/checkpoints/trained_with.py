@@ -94,8 +94,7 @@ def refuse_differences(lines: Iterable[str], *, policy: str, task: str) -> None:
 def about_sentence(trained: Sentences | None, sentence: str, *, policy: str, task: str) -> str | None:
     """Return a line if a policy is asked with a sentence that it was never trained with; else None.
 
-    It is not an error: whether a policy understands a paraphrase may be what is tested. Words in braces stand
-    for what differs per episode. Without `trained`, nothing is known.
+    It is not an error: a paraphrase may be what is tested. Words in braces differ per episode.
     """
     if not trained:
         return None

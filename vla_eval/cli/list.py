@@ -58,10 +58,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def print_rows(groups: Groups, *, indent: str = "") -> None:
-    """Print headings and rows; columns stand below each other in all groups, the last one is not padded.
-
-    On a terminal, the last column is folded below itself, or has lines of its own if it is narrow.
-    """
+    """Print headings and rows, with the same columns in all groups; a terminal folds the last column."""
     rows = [row for group in groups.values() for row in group]
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     for heading, group in groups.items():

@@ -217,11 +217,7 @@ def _run_grid(args: argparse.Namespace) -> int:
 
 
 def _run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | None:
-    """Run or resume each evaluation in `OUT/NAME`, or one shard of each, on `--cluster`.
-
-    Returns:
-        None once all are there; the exit code after a shard, or if a signal has stopped them.
-    """
+    """Run or resume each evaluation, or one shard of each; return the exit code after a shard or a signal."""
     from vla_eval.cli.shared.evaluations import evaluate_each
     from vla_eval.cli.shared.output import print_shard
 

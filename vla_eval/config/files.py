@@ -146,10 +146,7 @@ def apply_overrides(
     cls: type,
     free: Mapping[str, Sequence[str]] = types.MappingProxyType({}),
 ) -> None:
-    """Change `data` in place by `a.b=c` each, c read as YAML; refuse no `=`, no YAML, or no such field.
-
-    `free` is that of `set_field`.
-    """
+    """Change `data` in place by `a.b=c` each, c read as YAML; for `free`, see `set_field`."""
     for override in overrides:
         path, equals, text = override.partition("=")
         where = f"--set {override:.{MAX_SHOWN}}"

@@ -20,11 +20,7 @@ FREE_SETTINGS = ("stop_at_success", "eager_rendering", "render.backend")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Protocol:
-    """`protocols/*.yaml`. `docs/protocols.md` has the table of all fields.
-
-    Raises:
-        RecipeError: a value out of its range, or a group with a task that the protocol has not.
-    """
+    """`protocols/*.yaml`. `docs/protocols.md` has the table of all fields."""
 
     name: str
     # raised whenever a figure under the protocol would change

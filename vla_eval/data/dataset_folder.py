@@ -30,11 +30,7 @@ def check_complete(root: Path) -> Facts:
 
 
 def require_finished(root: Path) -> Facts:
-    """Return what a dataset says that it is; its files are not read.
-
-    Raises:
-        DatasetError: there is none, or it is not finished, or another program made it.
-    """
+    """Return what a dataset says that it is; its files are not read."""
     facts = find_facts(root)
     if facts is not None:
         return facts

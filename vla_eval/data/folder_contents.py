@@ -14,10 +14,7 @@ REMEDY = "It is not read. Copy the dataset with `cp -rL` if you trust where it l
 
 
 def check_folder(root: Path) -> None:
-    """Raise `DatasetError` unless all that lies below a folder is a regular file in it, or a folder.
-
-    The folder itself may be a link, since the user named it.
-    """
+    """Raise `DatasetError` unless all that lies below a folder is a regular file or a folder."""
     distrust(root)
     inside = root.resolve()
     blobs = inside.parent.parent / BLOBS if inside.parent.name == SNAPSHOTS else None

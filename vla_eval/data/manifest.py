@@ -227,11 +227,7 @@ def read_content(path: Path) -> bytes:
 
 
 def keep_report(dataset: Path, report: ReplayReport) -> None:
-    """Write the report, unless one that is there says more.
-
-    A mismatch is always written. A report without any is written if it is about all episodes, and does
-    not hide a mismatch of images that it has not compared.
-    """
+    """Write the report, unless one that is there says more: of all episodes, of images, or a mismatch."""
     if report.passed:
         before = read_replay(dataset)
         hides = (
@@ -247,11 +243,7 @@ def keep_report(dataset: Path, report: ReplayReport) -> None:
 
 
 def require_passed(dataset: Path, report: ReplayReport | None, manifest: str) -> ReplayReport | None:
-    """Return the report of a dataset's last replay, as `read_replay` returned it.
-
-    Raises:
-        DatasetError: the replay has failed, or was one of another manifest than that of this digest.
-    """
+    """Return the report of a dataset's last replay, as `read_replay` returned it."""
     if report is None:
         return None
     if report.manifest_sha256 != manifest:

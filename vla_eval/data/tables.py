@@ -43,11 +43,7 @@ Columns = dict[str, NDArray[np.generic]]
 def read_table(
     path: Path, keep: Callable[[str], bool] | None = None, *, with_images: bool = False
 ) -> Any:  # Any: pyarrow.Table
-    """Return a table of a dataset, or the columns that `keep` names, without Hugging Face's notes in it.
-
-    The file is of a folder that `check_folder` has seen; it may have images as lerobot embeds them
-    `with_images`.
-    """
+    """Return a table of a dataset, or the columns that `keep` names, without Hugging Face's notes in it."""
     try:
         with pq.ParquetFile(str(path.absolute())) as file:
             _check_size(path, file.metadata)

@@ -49,11 +49,7 @@ def share_vulkan(backend: str) -> None:
 
 
 def build(cls: Any, settings: EnvSettings, **arguments: Any) -> Any:
-    """Return a ManiSkill environment that renders only on request.
-
-    Raises:
-        RenderingError: cameras are wanted and the renderer does not start.
-    """
+    """Return a ManiSkill environment that renders only on request."""
     backend = render_backend(settings)
     share_vulkan(backend)
     if backend != "none":

@@ -37,11 +37,7 @@ _READING = re.compile(rf"texture\({TABLE}, vec2\(roughness, dotNV\)\)\.xy")
 
 @functools.cache
 def use_lean_shaders() -> bool:
-    """Let SAPIEN compile shaders without the table, from now on in this process.
-
-    Returns:
-        Whether it does; if not, the reason is logged.
-    """
+    """Let SAPIEN compile shaders without the table, from now on; return whether it does."""
     try:
         folder = _lean_copy(Path(str(resources.files(sapien) / SHADERS)))
     except OSError as exc:

@@ -51,10 +51,7 @@ class EpisodeGroup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeJob:
-    """One episode to run, where in a worker (`slot`) and in a forward pass (`row`, see `EpisodeStart.row`).
-
-    Slot and row are fixed by the seed, so that no result depends on workers or order.
-    """
+    """One episode to run, its slot in a worker and its row in a forward pass, both fixed by the seed."""
 
     group: EpisodeGroup
     run: int

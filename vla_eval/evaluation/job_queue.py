@@ -66,10 +66,7 @@ class JobQueue:
         return sum(len(batch.jobs) for batches in (self._heads, *self._rest.values()) for batch in batches)
 
     def take(self, loaded: Hashable | None, *, taken: Collection[Hashable] = ()) -> EpisodeBatch | None:
-        """Return the next batch for a worker, or None if there is no more.
-
-        Groups that other workers have loaded (`taken`) are avoided while there are others.
-        """
+        """Return the next batch for a worker, or None; preferably of a group that no other has loaded."""
         if self._heads:  # of several of one group, as `put_back_alone` leaves them, the worker keeps on
             index = next((i for i, batch in enumerate(self._heads) if batch.setup_key == loaded), 0)
             head = self._heads[index]

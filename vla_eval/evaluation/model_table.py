@@ -143,10 +143,6 @@ def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[s
     """Return the part of a table that has these tasks and rows (none: all), in the table's order.
 
     The folders are those of the whole table.
-
-    Raises:
-        UnknownNameError: one is not in the table.
-        RecipeError: no row, or none of these, is for one of the tasks.
     """
     check_names("task", tasks, table.tasks, where=table.name)
     check_names("row", rows, [row.name for row in table.rows], where=table.name)
@@ -222,8 +218,7 @@ def evaluations(
     """Yield run folder and configuration of every evaluation: task by task, the controls first.
 
     Each row has run folders of its own, so that a table keeps its results when rows or tasks are added.
-    The recipes that name the checkpoints are written to `out`: a row keeps its name, wherever its
-    weights are. `adapters` names the adapter of each row whose adapter is not lerobot's.
+    The recipes that name the checkpoints are written to `out`; `adapters` names those that are not lerobot's.
     """
     own = adapters or {}
     folder = out / EVALUATION_FOLDER

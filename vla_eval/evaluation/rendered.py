@@ -19,10 +19,7 @@ Reads = Literal["none", "last", "every"]
 
 
 def images_read(policies: Sequence[PolicyEntry]) -> dict[str, Reads]:
-    """Return the images that each policy of a configuration has to be given, by `EpisodeGroup.part`.
-
-    Of an adapter of another package nothing is known: it is taken to read every step's.
-    """
+    """Return the images that each policy has to be given, by `EpisodeGroup.part`; all if it is unknown."""
     return {
         policy.part(index): reads
         for policy in policies

@@ -105,11 +105,7 @@ class ResolvedEvaluation:
 def resolve(
     config: EvalConfig, *, backend: Backend = LOCAL, out: Path | None = None, shard: Shard | None = None
 ) -> ResolvedEvaluation:
-    """Read the policies of a configuration, ask policy servers, and decide what it leaves open.
-
-    The arguments are the fields of `ResolvedEvaluation`; `out` is by default a folder in `runs/`. Errors are
-    those of `load_policy_entry`.
-    """
+    """Read the policies of a configuration, ask policy servers, and decide what it leaves open."""
     policies = load_policy_entries(config.policies)
     return ResolvedEvaluation.of(config, policies, backend=backend, out=out, shard=shard)
 

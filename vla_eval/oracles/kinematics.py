@@ -44,16 +44,9 @@ def tool_pose(qpos: ArrayLike) -> Matrix:
 
 
 def inverse(pose: Matrix, near_rad: ArrayLike) -> Matrix | None:
-    """Return the (7,) joint positions, rad, within their limits, that bring the tool to a pose.
+    """Return joint positions (7,), rad, for a tool pose (4, 4); None if it is out of reach.
 
     Newton's method with the pseudoinverse of the Jacobian: of all solutions one near to the start.
-
-    Args:
-        pose: (4, 4) of the tool centre point.
-        near_rad: (7,) joint positions to start from.
-
-    Returns:
-        None if the pose is out of reach.
     """
     joints = np.array(near_rad, dtype=float)[:N_ARM_JOINTS]
     for _ in range(MAX_ITERATIONS):

@@ -30,14 +30,7 @@ class LowFlight:
     def plan_visits(
         self, state: PrivilegedState, wanted: Sequence[int], n_actions: int, *, in_order: bool
     ) -> NDArray[np.float32]:
-        """Return (n_actions, 7) that touch the wanted candidates.
-
-        Args:
-            state: the present state.
-            wanted: indices of the candidates that have not been touched yet; empty: rest.
-            n_actions: how many actions to plan.
-            in_order: touch them in the given order; otherwise always the nearest remaining one.
-        """
+        """Return (n_actions, 7) that touch the wanted candidates, `in_order` or the nearest first."""
         goals = {index: self._resting_point(state.candidate_positions_m[index]) for index in wanted}
         arm = model.arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
         rows = []

@@ -86,10 +86,7 @@ def build_page(
 
 
 def write_page(runs: Sequence[StoredRun], folder: Path, **options: Unpack[PageOptions]) -> Path:
-    """Write the page into a folder, which is made if it is not there, and return its path.
-
-    Errors as `build_page`; or `ReportError` if the page cannot be written there.
-    """
+    """Write the page into a folder, which is made if it is not there, and return its path."""
     page = build_page(runs, folder=folder, **options)
     path = folder / PAGE_FILE
     try:

@@ -31,10 +31,9 @@ class _Files(NamedTuple):
 
 
 def episode_list(material: Material, folder: Path | None) -> EpisodeList:
-    """Return all episodes of the table's rows; captures are linked from the folder, or the current one.
+    """Return all episodes of the table's rows, each in the order of `FIELDS`; what is undefined is null.
 
-    Each is a list in the order of `FIELDS`; what is undefined is null. Texts are numbers into lists of texts,
-    so that 30,000 episodes fit into a file of a few megabytes.
+    Texts are numbers into lists of texts, so that 30,000 episodes fit into a file of a few megabytes.
     """
     files = _files(material, folder or Path())
     errors: dict[str, int] = {}

@@ -50,13 +50,7 @@ def load_policy_entries(texts: Sequence[str]) -> tuple[PolicyEntry, ...]:
 
 
 def load_policy_entry(text: str) -> PolicyEntry:
-    """Return the policy that an entry of a configuration names.
-
-    Raises:
-        RecipeError: the checkpoints of one policy are not of the same kind, or one stands there twice.
-        RemoteChangedError: two servers of one policy are not of the same one.
-        UnknownNameError: there is no such policy, or no such task.
-    """
+    """Return the policy that an entry of a configuration names, with all its checkpoints."""
     named = named_checkpoints(text)
     _refuse_empty(text)
     if named is None:

@@ -85,10 +85,7 @@ class Grid:
 
 
 def plan_grid(config: EvalConfig, settings: GridSettings) -> Grid:
-    """Return the evaluations that a grid consists of, at `DEFAULT_N_ACTION_STEPS` unless K is configured.
-
-    All that the configuration names is the same everywhere but for what the settings change.
-    """
+    """Return the evaluations that a grid consists of, at `DEFAULT_N_ACTION_STEPS` unless K is configured."""
     refuse_own_arguments(config)
     if config.chunking.first_inference_step:
         raise RecipeError("chunking.first_inference_step: a grid sets it itself. Use --first-inference.")

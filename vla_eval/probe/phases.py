@@ -55,10 +55,7 @@ class Phases:
 
 
 def phases_of(spec: TaskSpec, env: Mapping[str, Any]) -> Phases | str | None:  # Any: a task's arguments
-    """Return the phases of a task with these arguments; None for a task without phases.
-
-    If the length of one is drawn per episode: the name of the argument that is not one number.
-    """
+    """Return the phases of a task, None if it has none, or the argument by which a length is drawn."""
     if spec.candidates is None:
         return None
     usual = {"cue_steps": CUE_STEPS, "delay_steps": default_delay_steps(spec)}

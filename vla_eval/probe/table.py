@@ -86,10 +86,7 @@ def policy_order(runs: Sequence[StoredRun]) -> tuple[str, ...]:
 def probe_table(
     worlds: Sequence[World], records: Sequence[Sequence[EpisodeRecord]], *, order: Sequence[str] = ()
 ) -> ProbeTable:
-    """Return the table of worlds, each with its records in any order; each task's `none` comes first.
-
-    `order` is that of the policies' names; others come last, by name.
-    """
+    """Return the table of worlds, `none` of each task first, policies in this order, then by name."""
     by_world = [(world, by_policy(found)) for world, found in zip(worlds, records, strict=True)]
     drawn = {world.task: found for world, found in by_world if world.intervention == AS_DRAWN}
     ranks = {name: rank for rank, name in enumerate(order)}

@@ -75,10 +75,9 @@ def report_choices(group: RowEpisodes) -> ChoiceReport | None:
 
 
 def find_habit(counts: Mapping[tuple[int, int | None], int], n_candidates: int) -> Habit | None:
-    """Test whether wrong choices prefer one index; right ones follow the target, wherever it is.
+    """Test whether wrong choices prefer one index; return the one with the smallest p value.
 
-    `counts` is (target, chosen or None) -> number of episodes. The index with the smallest p value is
-    returned; None if there is nothing to test: with two indices there is only one wrong choice.
+    `counts` is (target, chosen or None) -> number of episodes. None with two indices: one choice is wrong.
     """
     wrong = {pair: n for pair, n in counts.items() if pair[1] is not None and pair[0] != pair[1]}
     if n_candidates < 3 or not wrong:

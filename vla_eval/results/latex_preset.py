@@ -31,10 +31,7 @@ CHANCE_NAME = "chance, 1/N"
 
 
 def paper_preset(table: Table) -> str:
-    """Return a `table` environment that fits into one line width; it needs booktabs.
-
-    Tasks that do not fit side by side continue in a second block below the first.
-    """
+    """Return a `table` environment of one line width, in blocks below each other; it needs booktabs."""
     tasks = list(dict.fromkeys(row.task for row in table.rows))
     labels = dict.fromkeys(row.key.of_all_tasks for row in table.rows)
     names = {label: _name(label, list(labels), table.variants) for label in labels}
@@ -109,10 +106,9 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
 
 
 def _best(rows: Sequence[Row]) -> set[RowKey]:
-    """Return which rows are in bold: of each task the best policy, where it is shown to be the best.
+    """Return which rows are in bold: each task's best policy, if it is above chance and unlike the next one.
 
-    That is, above chance, and unlike the next policy on the same episodes (exact paired test, the p values
-    of all tasks corrected together).
+    Exact paired test on the same episodes, the p values of all tasks corrected together.
     """
     pairs = {}
     for task in dict.fromkeys(row.task for row in rows):

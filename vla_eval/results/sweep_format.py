@@ -23,11 +23,7 @@ JSON_VERSION = 1
 
 
 def render_sweep(sweep: Sweep, fmt: Format, *, width: int | None = None) -> str:
-    """Return the comparison as text, without the notes for CSV.
-
-    Markdown is to fit `width` characters, if given: what all rows share is said above the table, and columns
-    that do not fit are left out and named below it.
-    """
+    """Return the comparison as text; Markdown without the columns that do not fit `width`, named below it."""
     table = sweep_table(sweep)
     if fmt == "json":
         return _json(sweep, table.notes)

@@ -19,9 +19,6 @@ def lay_out(
 
     The default width is `FITS_CHARACTERS`. `wide`: all but the extra columns, however wide the table becomes
     and whatever is constant, and a row for each of several runs.
-
-    Raises:
-        UnknownNameError: there is no such column.
     """
     by_name = printed_columns(table.baselines)
     check_names("column", names, by_name, where="--columns")

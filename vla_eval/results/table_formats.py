@@ -61,11 +61,7 @@ def render_published(board: str, fmt: Format) -> str:
 def check_format(
     fmt: Format, *, columns: Sequence[str], wide: bool, preset: Preset | None, beside: bool
 ) -> None:
-    """Refuse what a format does not have, arguments as for `render`; `beside`: published results are added.
-
-    Raises:
-        ReportError: columns are selected for a format that has all of them, or a preset that it has not.
-    """
+    """Refuse what a format does not have, as `render` does; `beside`: published results are added."""
     if preset is not None and (fmt != "latex" or columns or wide or beside):
         raise ReportError(
             f"--preset {preset} is a whole table in LaTeX, with its own columns. Add --format latex, and "

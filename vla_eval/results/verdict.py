@@ -30,10 +30,7 @@ class Verdict(NamedTuple):
 
 
 def verdicts(table: Table) -> list[Verdict]:
-    """Return the verdict on each task of a table, in its order.
-
-    No verdict is given on scripted controls, unless nothing else was run: then on the oracle.
-    """
+    """Return the verdict on each task, in the table's order; the oracle's if only controls were run."""
     found = []
     for task in dict.fromkeys(row.task for row in table.rows):
         rows = [row for row in table.rows if row.task == task]

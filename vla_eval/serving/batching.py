@@ -68,10 +68,7 @@ _Request = _Begin | _Infer | _Forget
 
 
 class Batcher:
-    """Asks a policy, which nobody else may call any more, on behalf of many, with `n_rows` in a pass.
-
-    The futures that it returns are completed by its thread.
-    """
+    """Asks a policy on behalf of many, with `n_rows` in a pass; nobody else may call it any more."""
 
     def __init__(
         self,
@@ -103,10 +100,7 @@ class Batcher:
         self._put(_Forget(slot=slot))
 
     def close(self, *, seconds: float | None = None) -> bool:
-        """Finish the pass under way, cancel what has not begun, and end the thread; return whether it ended.
-
-        After `seconds` the thread is left alone; None: it is waited for as long as the pass takes.
-        """
+        """Finish the pass under way, cancel the rest, and end the thread; return whether it has ended."""
         with self._changed:
             self._is_closed = True
             waiting, self._queue = self._queue, deque()

@@ -23,10 +23,7 @@ class Counts:
 
 
 class ServerMetrics:
-    """Counts; the thread that infers writes them, others read.
-
-    That thread also calls `on_pass` with the seconds of each pass.
-    """
+    """Counts; written by the thread that infers, which also calls `on_pass` with each pass's seconds."""
 
     def __init__(
         self,

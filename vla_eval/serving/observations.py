@@ -83,10 +83,7 @@ class ObservationReader:
 
 
 def observation_reader(policy: PolicySpec, env: EnvSpec, *, end_effector: bool) -> ObservationReader:
-    """Return what reads the observations of a policy; `end_effector`: it also reads the kind `eef`.
-
-    A `SpecMismatchError` if the policy has a camera for which the wire has no key.
-    """
+    """Return what reads the observations of a policy; `end_effector`: it also reads the kind `eef`."""
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
     for camera in policy.cameras:
         if camera not in CAMERA_WIRE_KEYS:

@@ -124,10 +124,7 @@ class SessionTable:
         return start
 
     def begins(self, session: Session, request: Mapping[str, Any]) -> bool:
-        """Whether an `infer` begins an episode without a `reset`, which openpi's client never sends.
-
-        Its first request does, and each one with another instruction.
-        """
+        """Whether an `infer` begins an episode: openpi's client never sends a `reset`."""
         if session.episode is not None:
             is_same = request.get(PROMPT_WIRE_KEY) in (None, session.episode.instruction)
             if session.was_reset and not is_same:
@@ -172,10 +169,7 @@ class SessionTable:
         self._drop(idle, "no message came for too long (--idle-seconds)")
 
     def _make_room(self, connection: int, address: str) -> None:
-        """Drop a session of the same connection if one more would be too many; never one of another.
-
-        It is the one without a message for longest, of those without a request under way.
-        """
+        """Drop the longest silent idle session of the same connection if one more would be too many."""
         own = [key for key in self._sessions if key[0] == connection]
         n_of_address = sum(session.address == address for session in self._sessions.values())
         for n_sessions, limit, whose in (

@@ -57,10 +57,7 @@ class ServerReady:
 
 
 class SharedServers:
-    """The servers of one policy; a context manager that leaves none behind.
-
-    `stops` is asked while they start, each for at most `start_seconds`; true: give up.
-    """
+    """The servers of one policy; a context manager that leaves none behind."""
 
     def __init__(
         self,

@@ -19,11 +19,7 @@ MAX_NAMED = 5
 
 
 def parse_records(data: bytes, path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:
-    """Return the record that counts of each key, in the order in which the keys first appear.
-
-    Raises:
-        RunFolderError: a line is not a record, a key has two results, or an episode is not planned.
-    """
+    """Return the record that counts of each key, in the order in which the keys first appear."""
     records: dict[EpisodeKey, EpisodeRecord] = {}
     strangers: list[str] = []
     for line, where in whole_lines(data, path):
@@ -66,11 +62,7 @@ def _parse_record(line: bytes, where: str) -> EpisodeRecord:
 
 
 def repair_records(path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:
-    """Read the records, if there are any; make a last line that was torn by a kill whole, or cut it off.
-
-    Raises:
-        RunFolderError: a line is damaged, or an episode is not the run's; the file is left as it is.
-    """
+    """Read the records, if there are any; make a last line that was torn by a kill whole, or cut it off."""
     data = read_lines(path)
     tail = data[data.rfind(b"\n") + 1 :]
     if tail:

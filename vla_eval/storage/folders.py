@@ -17,12 +17,7 @@ UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder that a run cannot go into.
-
-    Raises:
-        RunFolderError: it is there and somebody else's, or is not a folder.
-        OSError: it cannot be read.
-    """
+    """Refuse a folder that a run cannot go into."""
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: expected a folder, found a file. Use another --out.")
     for name in SUBFOLDERS:

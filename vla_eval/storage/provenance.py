@@ -46,10 +46,7 @@ def collect_environment() -> dict[str, JsonValue]:
 def checkout_state(package: Path) -> dict[str, str | None]:
     """Return which source the package consists of, if it is imported from a git checkout.
 
-    Returns:
-        `commit`: the full hash. `changes`: digest of what differs from that commit below `package`,
-        tracked or not; None if nothing does. Both None for an installed wheel, or where git is
-        missing or refuses.
+    `commit`: the full hash. `changes`: digest of what differs from it below `package`. Both None without git.
     """
     unknown: dict[str, str | None] = {"commit": None, "changes": None}
     root = package.parent

@@ -1,7 +1,4 @@
-"""Compare what shards were started with, and describe the whole that they come to.
-
-The same for the shards of runs and of recordings: it knows nothing of what their folders hold.
-"""
+"""Compare what shards of runs or recordings were started with, and describe the whole that they come to."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -34,11 +31,7 @@ def as_part(path: Path, run_file: RunFile) -> ShardPart:
 
 
 def merge_descriptions(parts: Sequence[ShardPart], *, allow_environment_change: bool) -> RunFile:
-    """Return what one run's `run.json` would hold, with the sessions of all shards.
-
-    Raises:
-        MergeError: two are the same shard, or of different plans or, unless that is allowed, environments.
-    """
+    """Return what one run's `run.json` would hold, with the sessions of all shards."""
     first, *others = parts
     for other in others:
         _refuse_other_plan(first, other)

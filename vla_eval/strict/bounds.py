@@ -67,10 +67,9 @@ def _bounds_of(cls: type) -> dict[str, Bounds]:
 def check_bounds(
     recipe: object, bounds: Mapping[str, tuple[float, float]] | None = None, *, prefix: str = ""
 ) -> None:
-    """Raise `RecipeError` unless the numbers in these attributes are within (least, most).
+    """Raise `RecipeError` unless the numbers in these attributes are within (least, most), or None or a word.
 
-    Attributes that are None or a word are passed over. The bounds are by default those that the dataclass
-    annotates its fields with. The prefix (`finetune.`) stands before the names in the message.
+    The bounds are by default those that the dataclass annotates; the prefix (`finetune.`) is for messages.
     """
     cls: Any = type(recipe)  # Any: mypy does not see that a class can be hashed
     for name, (least, most) in (_bounds_of(cls) if bounds is None else bounds).items():

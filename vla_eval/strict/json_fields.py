@@ -64,10 +64,7 @@ def get_texts(data: Mapping[str, Any], key: str, *, where: str) -> list[str]:
 
 
 def get_count(data: Mapping[str, Any], key: str, *, maximum: int, where: str) -> int | None:
-    """Return a field that counts something, from 1 to `maximum`; None if it is absent or null.
-
-    Anything else is refused: true is not 1, and "4" not 4.
-    """
+    """Return a field that counts something, from 1 to `maximum`; None if it is absent or null."""
     value = data.get(key)
     if value is not None and (type(value) is not int or not 1 <= value <= maximum):
         raise wrong_type(where, key, f"a whole number from 1 to {maximum:,}", value)

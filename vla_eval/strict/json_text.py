@@ -82,10 +82,7 @@ def read_version(data: dict[str, Any], name: str, known: int, source: Source) ->
 
 
 def as_dataclass[T](cls: type[T], data: Any, source: Source) -> T:  # Any: JSON
-    """Return JSON as an object of a dataclass whose annotations say what each field may be.
-
-    Its fields may be dataclasses, too. An unknown or missing field, or one of another type, is refused.
-    """
+    """Return JSON as an object of a dataclass whose annotations say what each field, also nested, may be."""
     import pydantic_core
 
     try:

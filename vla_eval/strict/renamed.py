@@ -28,10 +28,7 @@ def current_names(cls: type) -> dict[str, str]:
 
 
 def use_current_names(cls: type, data: dict[str, Any], *, prefix: str) -> None:
-    """Give the renamed fields in the plain data of a dataclass their current names, in place.
-
-    `prefix` precedes the names in messages. A field that is there under both names is refused.
-    """
+    """Give the renamed fields in the plain data of a dataclass their current names, in place."""
     for old, new in current_names(cls).items():
         if old not in data:
             continue

@@ -37,9 +37,6 @@ def load_yaml(text: str, *, where: str) -> Any:  # Any: whatever the YAML holds
     """Read YAML; no field may be given twice.
 
     Numbers may be infinite or not a number; `decode` refuses them by their fields' names.
-
-    Raises:
-        RecipeError: it is not plain data, or too large; the message has line and column.
     """
     if len(text) > MAX_CHARACTERS:
         raise RecipeError(f"{where}: found more than {MAX_CHARACTERS} characters; a recipe is a short text.")

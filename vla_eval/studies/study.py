@@ -51,11 +51,7 @@ class Study:
 def open_study(
     name: str, *, tasks: Sequence[str], rows: Sequence[str], out: Path | None, is_tiny: bool, command: str
 ) -> Study:
-    """Read a table by its file, or its name in `configs/`; of some tasks and rows, or all if none is named.
-
-    `out` is by default a folder in `runs/`; `is_tiny` puts tiny random models in place of the rows'. A
-    `VlaEvalError` if there is no such table, row or task.
-    """
+    """Read a table by its file, or its name in `configs/`; `is_tiny` replaces the rows' models."""
     table = narrow(load_model_table(name), tasks=tasks, rows=rows)
     folder = out or RUNS_FOLDER / (table.name + ("_tiny" if is_tiny else ""))
     adapters: dict[str, str] = {}
@@ -210,10 +206,7 @@ def finetune_on(
     say: Callable[[str], None],
     is_stopping: Callable[[], bool],
 ) -> bool:
-    """Run the fine-tunings; a GPU each, where there are GPUs. Return False if asked to stop.
-
-    `logs` is a folder on storage that all machines share. `is_tiny` builds lerobot's π0 in its tiny form.
-    """
+    """Run the fine-tunings, a GPU each; return False if asked to stop. All machines share `logs`."""
     logs.mkdir(parents=True, exist_ok=True)
     jobs = [FinetuneJob(config=one.config, command=command, name=one.name) for one in todo]
     timeouts = TimeoutConfig(setup_seconds=MAX_SECONDS)

@@ -30,13 +30,9 @@ def check_recipe(
     report: Callable[[str], None],
     say: Callable[[str], None] = lambda _line: None,
 ) -> list[str]:
-    """Check the policy of an evaluation; return what is met.
+    """Check the policy of an evaluation, given what `task` shows; return and `report` what is met.
 
-    Args:
-        policy: as `load_policy_entry` returns it.
-        task: the task whose cameras, states and actions it is given.
-        report: called with each requirement that is met, as soon as that is known.
-        say: gets what differs from the policy's training and is not a requirement, line by line.
+    `say` gets what differs from the policy's training and is not a requirement, line by line.
     """
     config = EvalConfig(
         name="check",

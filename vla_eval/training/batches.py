@@ -45,10 +45,7 @@ class Sharing:
 
 
 class StepBatches(Sampler[list[Any]]):
-    """Yields this process's indices for each step, from `start` on, without end.
-
-    `numbered`: yield (index, epoch, number in the epoch) for each sample, see `SeededSamples`.
-    """
+    """Yields this process's indices for each step; if `numbered`, as `SeededSamples` takes them."""
 
     def __init__(
         self, sampler: EpisodeAwareSampler, start: Position, sharing: Sharing, *, numbered: bool = False

@@ -25,13 +25,7 @@ LOSS_SCALE_FILE = "loss_scale.json"
 def write_checkpoint(
     job: TrainingJob, step: int, accelerator: Any, parts: dict[str, Any], scaler: Any
 ) -> Path | None:
-    """Write the checkpoint of a step, counted from 1; every process has to take part, the first one writes.
-
-    `parts` are those of lerobot's `save_checkpoint`; the scaler is enabled in float16 alone.
-
-    Returns:
-        The folder (`…/000100`); None in the other processes.
-    """
+    """Write the checkpoint of a step, with all processes; return its folder in the first one."""
     if accelerator.distributed_type == DistributedType.FSDP:  # each process has a share of the weights
         gathered = train_utils.gather_fsdp_state_dicts(parts["policy"], parts["optimizer"])
         parts["model_state_dict"], parts["optim_state_dict"] = gathered

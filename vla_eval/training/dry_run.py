@@ -59,10 +59,7 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DryRunOptions:
-    """What is assumed: the device's memory, None: that of the GPU here; its rate, None: a usual one.
-
-    `assume` returns the policy's configuration where the base or the dataset is missing.
-    """
+    """What is assumed: memory (None: the GPU's), rate, and a configuration without base or dataset."""
 
     device_bytes: float | None = None
     tflops: float | None = None

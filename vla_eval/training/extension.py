@@ -28,11 +28,7 @@ class OtherRate(NamedTuple):
 
 
 def check_steps(job: TrainingJob, config: FinetuneConfig, before: int, done: int) -> None:
-    """Refuse another number of steps than `before`, unless the steps that are done would have been the same.
-
-    Raises:
-        TrainingError: they would not, or more are done than are asked for.
-    """
+    """Refuse another number of steps than `before`, unless the steps done would have been the same."""
     asked = job.recipe.steps
     if asked < done:
         raise TrainingError(
@@ -52,10 +48,7 @@ def check_steps(job: TrainingJob, config: FinetuneConfig, before: int, done: int
 
 
 def first_other_rate(policy: Any, before: int, now: int, *, n_steps: int) -> OtherRate | None:
-    """Compare the schedules of two numbers of steps over the first `n_steps`; None: they begin alike.
-
-    The rate of a step is set by the one before it.
-    """
+    """Compare the schedules of two numbers of steps over the first `n_steps`; None: they begin alike."""
     pairs = zip(_rates(policy, before), _rates(policy, now), strict=False)
     for step, (rate, other) in zip(range(1, n_steps + 1), pairs, strict=False):
         if rate != other:

@@ -148,12 +148,7 @@ class _UntilStopped(EvaluationObserver):
 
 
 def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "OpenDataset") -> str:
-    """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints.
-
-    Raises:
-        RecipeError: the seeds are used for something else, or steps, task or control mode do not fit.
-        UnknownNameError: there is no such task.
-    """
+    """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints."""
     if settings.every_steps % recipe.save_every_steps:
         raise RecipeError(
             f"held_out.every_steps is {settings.every_steps}, expected a multiple of finetune."
@@ -189,11 +184,7 @@ def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "Op
 
 
 def check_asked(settings: HeldOutConfig, task: str, facts: TrainingFacts, *, policy: str) -> None:
-    """Refuse an evaluation that gives a policy something else than it is trained with.
-
-    Raises:
-        SpecMismatchError: it does, in a way that every evaluation would refuse after hours of training.
-    """
+    """Refuse an evaluation that gives a policy something else than it is trained with."""
     env = offered_by(task_spec(task), settings.env)
     sizes = {(camera.height_px, camera.width_px) for camera in env.cameras}
     images = dict.fromkeys(facts.images, sizes.pop())

@@ -73,14 +73,7 @@ class Listeners:
 
 
 def train(job: TrainingJob, listeners: Listeners) -> bool:
-    """Train to the job's last step; a finished job is left as it is.
-
-    Returns:
-        Whether the last step is done; False if training was asked to stop.
-
-    Raises:
-        TrainingError: the loss is not finite, or the model does not fit the job.
-    """
+    """Train to the job's last step; a finished job is left as it is. False if training was asked to stop."""
     recipe = job.recipe
     if job.first_step >= recipe.steps:
         return True

@@ -77,10 +77,7 @@ def _filled(model: Any, job: TrainingJob, weights: Path) -> Any:
 
 
 def make_processors(job: TrainingJob, model: Any, meta: Any) -> Processors:
-    """Return the processors: those of the weights' folder, with this machine's tokenizer, or new ones.
-
-    Unless training resumes, they normalise by the dataset's statistics, made usable.
-    """
+    """Return the processors: those of the weights' folder, or new ones by the dataset's statistics."""
     stats = usable_statistics(meta.stats, meta.features) if job.resume_from is None else None
     kwargs: dict[str, Any] = {} if stats is None else {"dataset_stats": stats}
     if job.weights is not None:

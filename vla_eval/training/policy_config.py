@@ -44,12 +44,7 @@ class UsedFrames(NamedTuple):
 
 
 def asked_policy(recipe: FinetuneRecipe, cls: Any, base: Path | None, *, device: str) -> Any:
-    """Return lerobot's configuration, of this class, that a recipe asks for on top of its base's.
-
-    Raises:
-        RecipeError: a field that the policy does not have, or a value that it refuses.
-        CheckpointError: the base checkpoint cannot be read.
-    """
+    """Return lerobot's configuration, of this class, that a recipe asks for on top of its base's."""
     known = [field.name for field in dataclasses.fields(cls)]
     check_names("field", recipe.policy, known, where=f"finetune.policy ({recipe.type})")
     data: dict[str, Any] = {}
@@ -74,11 +69,7 @@ def asked_policy(recipe: FinetuneRecipe, cls: Any, base: Path | None, *, device:
 
 
 def fit_to_dataset(config: Any, recipe: FinetuneRecipe, dataset: OpenDataset) -> None:
-    """Give a configuration the dataset's fields, and what the policy computes from its numbers.
-
-    Raises:
-        SpecMismatchError: the recipe renames cameras that are not there, or the policy refuses the fields.
-    """
+    """Give a configuration the dataset's fields, and what the policy computes from its numbers."""
     with plain_errors(recipe.base_checkpoint or "finetune.policy", recipe.type, "does not fit the dataset"):
         _set_features(config, recipe, dataset)
         if hasattr(config, "fit_to_control_mode"):
@@ -149,11 +140,7 @@ def masks_padding(config: Any) -> bool:
 
 
 def used_frames(config: Any, dataset: OpenDataset) -> UsedFrames:
-    """Return the number of frames that are trained on.
-
-    Raises:
-        SpecMismatchError: none, since chunks are longer than the episodes.
-    """
+    """Return the number of frames that are trained on."""
     dropped = getattr(config, "drop_n_last_frames", 0)
     lengths = dataset.lengths
     used = UsedFrames(sum(max(0, length - dropped) for length in lengths), sum(lengths))

@@ -39,11 +39,7 @@ class FinetuneSummary:
 
 
 def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
-    """Return the policy's recipe for fine-tuning, with the configuration's values on top.
-
-    Raises:
-        RecipeError: a folder is named, or the recipe has nothing to train.
-    """
+    """Return the policy's recipe for fine-tuning, with the configuration's values on top."""
     name = config.policy
     if os.path.isdir(name) and Path(name).name not in list_recipes("policies"):
         raise RecipeError(_no_recipe(Path(name)))
@@ -82,10 +78,7 @@ def _no_recipe(folder: Path) -> str:
 
 
 def look_for(config: FinetuneConfig, *, is_dry: bool = False) -> None:
-    """Look for recipe, dataset and base, before torch is loaded; `training_job` looks closer.
-
-    A dry run needs neither dataset nor base.
-    """
+    """Look for recipe, dataset and base (not in a dry run), before torch is loaded."""
     recipe = load_finetune_recipe(config).value
     if is_dry and not os.path.isdir(config.dataset):
         return

@@ -145,10 +145,7 @@ def whole_checkpoints(path: Path) -> list[Path]:
 
 
 def drop_extra_checkpoints(path: Path, *, save_every_steps: int) -> None:
-    """Remove all checkpoints but the newest that were written only because a training was asked to stop.
-
-    One that was the last of a training that has been extended stays.
-    """
+    """Remove the checkpoints, but the newest, that were written only because a training was stopped."""
     ends = {change["before"] for change in read_record(path).get(STEPS_CHANGED, ())}
     for folder in whole_checkpoints(path)[:-1]:
         if int(folder.name) % save_every_steps and int(folder.name) not in ends:

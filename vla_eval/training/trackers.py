@@ -96,10 +96,6 @@ def services(job: TrainingJob, say: Callable[[str], None]) -> Iterator[Services]
 
     A training that is resumed continues the runs of its name. Steps between the last checkpoint and a kill
     are then there twice; `metrics.jsonl` has each once.
-
-    Raises:
-        MissingDependencyError: a package is not installed.
-        TrainingError: wandb has no key, or settings that it refuses.
     """
     found, asked = Services(say), [field for field in PACKAGES if getattr(job.recipe, field)]
     for field in asked:  # all of them, before one begins to write

@@ -51,12 +51,7 @@ class EpisodeCapture:
         heartbeat: Callable[[Stage], None],
         film: Callable[[EpisodeTape], EpisodeTape],
     ) -> None:
-        """Write the captures of a finished batch; its starts and records are in the same order.
-
-        `film` returns the tape of an episode with images; it is called for those that are wanted. `heartbeat`
-        is called before each file: the watchdog gives each the time of a step. A file that cannot
-        be written is a `ViewingError`.
-        """
+        """Write the captures of a finished batch; `film` renders those that have no images yet."""
         for start, record in zip(starts, records, strict=True):
             tape = tapes.episodes.get(start.slot)
             for_video, for_rrd = (

@@ -28,10 +28,7 @@ class SheetRow:
 
 
 def contact_sheet(columns: Sequence[str], rows: Sequence[SheetRow], *, title: Sequence[str] = ()) -> bytes:
-    """Return a PNG file of all rows below each other; the same input gives the same bytes.
-
-    Above each frame stands the name of its column, above everything the lines of the title.
-    """
+    """Return a PNG file of the titled columns and rows; the same input gives the same bytes."""
     height, width = rows[0].frames[0].shape[:2]
     first_top = LABEL_PX * (len(title) + 1) + EDGE_PX + MARGIN_PX
     sheet = np.full(

@@ -12,16 +12,7 @@ from vla_eval.viz.tape import EpisodeTape, Tapes
 def film_again(
     tape: EpisodeTape, env: SimEnv, heartbeat: Callable[[Stage], None] = lambda _stage: None
 ) -> EpisodeTape:
-    """Return the tape of an episode with images at its stride, and at the horizon.
-
-    Args:
-        tape: the episode, without images.
-        env: an environment with the same settings that also renders what is captured; slot 0 is used.
-        heartbeat: called with what is about to be done, for a watchdog.
-
-    Raises:
-        ViewingError: the same actions gave another episode.
-    """
+    """Return the tape of an episode with images at its stride, and at the horizon."""
     film = Tapes({tape.start.slot}, frame_stride=tape.frame_stride)
     for one in tape.steps:
         if one.action is None:

@@ -22,10 +22,7 @@ class StripFrame(NamedTuple):
 
 
 def read_strip(path: Path, *, n_frames: int, n_steps: int, control_hz: float) -> list[StripFrame]:
-    """Return frames of `write_video` from the first to the last step, as evenly spaced as the video has them.
-
-    They are fewer than `n_frames` if the video does not have as many. A `ViewingError` if it cannot be read.
-    """
+    """Return at most `n_frames` frames of a video from first to last step, as even as it has them."""
     try:
         with open_mp4(path, ViewingError) as container:
             rate = container.streams.video[0].average_rate

@@ -46,10 +46,7 @@ class Part:
 
 
 def compose(tape: EpisodeTape, taped: TapedStep, record: EpisodeRecord, *, n_held: int = 1) -> ImageArray:
-    """Return one frame of an episode, (H, W, 3) uint8 with even sides, of a step that has images.
-
-    `n_held` is how many frames of the video this one is held for; above 1 it is said.
-    """
+    """Return one frame of the video, (H, W, 3) uint8 with even sides; it is held for `n_held`."""
     images = taped.result.observation.images
     small = [name for name in images if name != HUMAN_CAMERA]
     canvas = Image.new("RGB", (WIDTH_PX, VIEW_PX + PANEL_PX), PAPER)

@@ -47,10 +47,7 @@ def write_stills(tape: EpisodeTape, path: Path) -> None:
 
 
 def read_stills(path: Path) -> tuple[ImageArray, ...]:
-    """Return the moments that `write_stills` has written, each (STILL_PX, STILL_PX, 3) uint8.
-
-    Those of earlier versions, which were smaller, are scaled. An `OSError` if it is not such an image.
-    """
+    """Return the moments of `write_stills`, each (STILL_PX, STILL_PX, 3) uint8, scaled if older."""
     n_moments = len(Moments._fields)
     with Image.open(path) as image:
         if image.width != n_moments * image.height:

@@ -18,10 +18,7 @@ APPLICATION = "mikasa-vla"
 def rrd_when_whole(
     path: Path, *, recording_id: str, blueprint: rrb.Blueprint, failed: str, advice: str
 ) -> Iterator[rr.RecordingStream]:
-    """Give a stream to log to. The file gets its name once everything is in it.
-
-    If it cannot be written, a `ViewingError` has `failed` before the cause and `advice` after it.
-    """
+    """Give a stream to log to; the file gets its name once everything is in it."""
     unfinished = path.with_suffix(".part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -43,10 +43,7 @@ COLORS = {
 
 
 def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvSpec) -> None:
-    """Write one episode; the file is there whole or not at all, with a `ViewingError` in its place.
-
-    `env` names the numbers of an action, and the control steps per second for the timeline `time`.
-    """
+    """Write one episode; the file is there whole or not at all, with a `ViewingError` in its place."""
     n_series = n_overlapping(tape)
     cameras = sorted({name for one in tape.steps for name in one.result.observation.images})
     with rrd_when_whole(
@@ -117,10 +114,7 @@ def log_arm(stream: rr.RecordingStream, qpos: FloatArray, tcp_position_m: FloatA
 
 
 def arm_points_m(qpos: FloatArray, tcp_position_m: FloatArray) -> FloatArray | None:
-    """Return (10, 3): base, the seven joints, the flange and the tool centre point, in m, world frame.
-
-    None if the line would not end at the simulator's tool centre point: it is another arm, or no arm at all.
-    """
+    """Return (10, 3): base, joints, flange and tool, m, world frame; None for another arm than the Panda."""
     if len(qpos) < N_ARM_JOINTS:
         return None
     poses = joint_poses(qpos)

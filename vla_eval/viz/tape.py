@@ -29,10 +29,7 @@ class TapedChunk:
 
 @dataclass(slots=True, kw_only=True)
 class EpisodeTape:
-    """One episode so far, with steps and chunks in order.
-
-    Images were requested at every `frame_stride`-th step; others may have requested more.
-    """
+    """One episode so far: steps and chunks in order, with images at least at every `frame_stride`-th step."""
 
     start: EpisodeStart
     frame_stride: int

@@ -33,9 +33,8 @@ def write_video(
 ) -> None:
     """Write the captured steps of an episode as an mp4, which is there whole or not at all.
 
-    `thumbnail` is a JPEG of the cue and next to it the choice, `stills` a small one of cue, reveal and touch,
-    for `report --filmstrip`. `frame_rate_hz` are captured steps per second of the episode, so that the video
-    is as fast as the episode, but for the cue.
+    `thumbnail` is a JPEG of cue and choice, `stills` one of cue, reveal and touch, for `report --filmstrip`.
+    `frame_rate_hz` are captured steps per second of the episode.
     """
     captured = tape.captured()
     if not captured:

@@ -112,10 +112,7 @@ def _marked(value: Any, text_markers: bool) -> Any:
 
 
 def unpackb(data: Any) -> Any:
-    """Return the message that bytes hold; a `CodecError` for anything else, and for what is refused.
-
-    Arrays in it are new, writable and in this machine's byte order.
-    """
+    """Return the message that bytes hold, arrays new and writable; a `CodecError` for whatever is refused."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise CodecError(_too_large(len(data)))
     budget = _Budget()

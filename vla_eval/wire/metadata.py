@@ -78,10 +78,7 @@ class ServerMetadata:
 
     @property
     def takes_sessions(self) -> bool:
-        """Whether requests may hold `endpoint` and `session_id`.
-
-        RoboArena's servers want them in every request; they announce them by `needs_session_id` alone.
-        """
+        """Whether requests may hold `endpoint` and `session_id`, as RoboArena's servers demand."""
         return self.is_ours or self.needs_session_id is not None
 
     @property
@@ -124,10 +121,7 @@ class ServerMetadata:
 
     @classmethod
     def from_wire(cls, message: object, *, where: str) -> "ServerMetadata":
-        """Read the first message of a server; `where` is its address, for messages.
-
-        A `RemoteReplyError` if it is not a map, or a known field has another type.
-        """
+        """Read the first message of a server; `where` is its address, for messages."""
         if not isinstance(message, Mapping):
             raise RemoteReplyError(
                 f"{where}: expected a map as the first message (the server's metadata), found "

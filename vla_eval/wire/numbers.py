@@ -22,11 +22,7 @@ class NumbersError(ValueError):
 
 
 def as_state(value: Any, names: Sequence[str]) -> np.ndarray[Any, Any]:
-    """Return a state, float32 or float64, as a new float32 array with a number for each name.
-
-    Raises:
-        NumbersError: it has another type or shape, a number that is not finite, or not a rotation.
-    """
+    """Return a state, float32 or float64, as a new float32 array with a number for each name."""
     expected = f"an array of {len(names)} numbers, float32 or float64"
     if not isinstance(value, np.ndarray):
         raise NumbersError(f"expected {expected}; found {type(value).__name__}")

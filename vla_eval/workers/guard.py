@@ -28,10 +28,7 @@ PR_SET_CHILD_SUBREAPER = 36
 
 
 def fork_guarded(lifeline: Connection) -> None:
-    """Return in a child of this process, which stays behind as its guard and never returns.
-
-    The parent sends `ASK_WHERE` and `END` through `lifeline`.
-    """
+    """Return in a child of this process, which stays behind as its guard and obeys `ASK_WHERE` and `END`."""
     with contextlib.suppress(PermissionError):  # a leader of a group is alone in it already
         os.setsid()  # signals to the command's group are for the command
     become_subreaper()

@@ -62,11 +62,7 @@ spawn.get_preparation_data = _without_script
 
 
 def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnContext:
-    """Return what makes worker processes.
-
-    The server imports the modules of `preload` before the first fork. It starts with the first worker of
-    this process; what is named later, workers import before they are locked.
-    """
+    """Return what makes worker processes, from a server that imports `preload` before the first fork."""
     if nvidia_driver_version() is not None:
         return multiprocessing.get_context("spawn")
     _preloaded.update(dict.fromkeys(preload))
@@ -83,10 +79,7 @@ def simulator_modules(simulator: Simulator) -> tuple[str, ...]:
 def begin(
     environment: Mapping[str, str], lifeline: Connection, main: Callable[..., None], *args: object
 ) -> None:
-    """Run `main` in a guarded worker as if the process had been started with this environment.
-
-    The server keeps the environment of its own start, which may be of an earlier pool.
-    """
+    """Run `main` in a guarded worker with this environment; the server keeps that of its own start."""
     fork_guarded(lifeline)
     _leave_helpers()
     os.environ.clear()

@@ -195,8 +195,7 @@ def read_config[T](
 ) -> T:
     """Return a configuration: the file `name`, or the fields `start` in its place, with the flags on top.
 
-    Without a file, each field in `needed` must be there; else a message names its flag, what is asked for,
-    and an `example`.
+    Without a file, a field of `needed` that is missing is refused with its flag, `asks` and an `example`.
     """
     from vla_eval.tasks.catalog import with_version
 

@@ -17,10 +17,9 @@ def backend_of(
     needs: Callable[[], tuple[Needed, ...]] = tuple,
     notes_kinds: bool = True,
 ) -> Iterator[Backend]:
-    """Give what `--cluster` names; without it, this machine.
+    """Give what `--cluster` names, whose machines must have the files of `needs`; without it, this machine.
 
-    `needs` returns the files that each machine of a cluster must have. Where results do not note the kind of
-    machine they are from (`notes_kinds`), there must be one kind.
+    Where results do not note the kind of machine (`notes_kinds`), there must be one kind.
     """
     if args.cluster is None:
         yield LOCAL

@@ -41,8 +41,7 @@ def evaluate_each(
 ) -> Evaluations:
     """Run or resume each evaluation, (run folder, configuration); a signal stops it and those after it.
 
-    One that another process is writing comes after all others, so that several processes share the work. Of
-    `args`: `--shard`, `--allow-environment-change` and `--json-progress`.
+    One that another process is writing comes last, so that several processes share the work.
     """
     n_errors = 0
     put_off: list[tuple[Path, EvalConfig]] = []

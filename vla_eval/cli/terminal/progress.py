@@ -46,19 +46,13 @@ class StopRequest:
 
     @property
     def exit_code(self) -> int:
-        """What shells expect of a command that a signal has ended; without one, that of SIGTERM.
-
-        Of several processes that train together, the others stop, too.
-        """
+        """What shells expect of a command that a signal has ended; without one, that of SIGTERM."""
         return 128 + (self.signal_number or signal.SIGTERM)
 
 
 @contextmanager
 def stop_on_signals(answer: str = "") -> Iterator[StopRequest]:
-    """Turn Ctrl-C, SIGTERM and SIGHUP into a request, so that no record is cut in the middle.
-
-    The first one gets the `answer` on standard error; a second one raises KeyboardInterrupt.
-    """
+    """Turn the first Ctrl-C, SIGTERM or SIGHUP into a request; a second one raises KeyboardInterrupt."""
     request = StopRequest()
 
     def ask(number: int, _frame: FrameType | None) -> None:
@@ -90,10 +84,7 @@ def evaluate_with_progress(
     allow_environment_change: bool,
     json_progress: int | None,
 ) -> EvaluationSummary:
-    """Run an evaluation with progress on standard error, and end early if asked to stop.
-
-    `json_progress` is the file descriptor of lines for other programs.
-    """
+    """Run an evaluation with progress on standard error, and end early if asked to stop."""
     capture = resolved.config.capture
     progress = Progress(stop, out=resolved.out, capture=capture, json_progress=json_progress)
     try:

@@ -39,10 +39,7 @@ from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 def copy_with_actions(
     source: Path, path: Path, episodes: Sequence[RecordedEpisode], recipe: DatasetRecipe
 ) -> DatasetFacts:
-    """Write a dataset with the images and states of another one; it appears whole. Return what it is.
-
-    `episodes` are those of the source with other actions; the recipe says which of these are stored.
-    """
+    """Write a dataset with the images and states of another one and other actions; return what it is."""
     if path.exists():
         raise DatasetError(f"{path}: is there already. Name another --out.")
     facts = check_dataset(source)

@@ -164,10 +164,7 @@ class JointAims(Protocol):
 def convert_episode(
     old: SimEnv, new: SimEnv, episode: RecordedEpisode, columns: Columns, plan: TaskPlan
 ) -> tuple[Attempt, str]:
-    """Return an episode in the mode of the new environment, and why it does not survive, or an empty text.
-
-    `old` is the environment of the recording, `columns` are the numbers of the recorded dataset.
-    """
+    """Return an episode in the mode of `new`, and why it does not survive there, or an empty text."""
     aims, log = _aims(old, episode)
     rows = rows_of_episode(columns, episode.episode_index)
     different = check_states(episode, rows, log, expect_equal_bits=False)

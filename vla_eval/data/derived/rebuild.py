@@ -36,11 +36,7 @@ def rebuild(
     workers: int | Literal["auto"] = "auto",
     backend: Backend = LOCAL,
 ) -> Rebuilt | None:
-    """Rebuild a dataset in OUT/TASK from its manifest; after an interruption the same call resumes.
-
-    Returns:
-        The new dataset; None if the observer asked to stop.
-    """
+    """Rebuild a dataset in OUT/TASK from its manifest; None if asked to stop: the same call resumes."""
     episodes = read_manifest(dataset)
     if not episodes:
         raise DatasetError(f"{dataset}: the manifest has no episodes.")

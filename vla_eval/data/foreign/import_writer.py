@@ -113,10 +113,7 @@ class ImportWriter:
 
 
 def eef_of_proprio(proprio: FloatArray) -> FloatArray:
-    """Return our end-effector state (10,) of the authors' (7,): see `features.STATE_NAMES`.
-
-    The angles are those of Rz(yaw) Ry(pitch) Rx(roll), the inverse of how their wrapper computes them.
-    """
+    """Return our end-effector state (10,) of the authors' (7,), with angles of Rz(yaw) Ry(pitch) Rx(roll)."""
     cos, sin = np.cos(proprio[3:6].astype(np.float64)), np.sin(proprio[3:6].astype(np.float64))
     (cr, cp, cy), (sr, sp, sy) = cos, sin
     first = (cy * cp, sy * cp, -sp)

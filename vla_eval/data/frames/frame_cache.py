@@ -66,10 +66,7 @@ class FrameSource:
 
 
 def episode_rows(dataset: Any, columns: Mapping[str, Any]) -> list[EpisodeRows]:
-    """Return where the episodes of a loaded `LeRobotDataset` are.
-
-    `columns` has `index`, `episode_index` and `timestamp`, as arrays or tensors of the loaded rows.
-    """
+    """Return where the episodes of a loaded `LeRobotDataset` are, by the columns of its rows."""
     indices, numbers, times_s = (columns[key].tolist() for key in ("index", "episode_index", "timestamp"))
     episodes = []
     row = 0
@@ -170,8 +167,7 @@ def frames_in_ram(source: FrameSource) -> dict[str, ImageArray]:
 def frames_on_disk(source: FrameSource, cache: Path | None) -> dict[str, Path]:
     """Return camera -> `.npy` file of its frames, decoding them if the folder has none yet.
 
-    The folder, in `cache` or by default the user's, appears by a rename, so half a cache is never seen; of
-    several processes that ask at once one decodes and the others wait.
+    The folder appears by a rename; of several processes that ask at once one decodes and the others wait.
     """
     name = f"{FRAMES_FOLDER}/{dataset_digest(source)}"
     final = cached(name) if cache is None else cache / name

@@ -27,9 +27,8 @@ NO_ROW = -1
 class RememberedFramesDataset(DecodedFramesDataset):
     """A dataset whose samples have memory; for the rest see `DecodedFramesDataset`.
 
-    With `memory.segments` each field has an axis of time: the frames of the episode at which the policy
-    writes its memory, the sample's own frame last. Before the episode's beginning there is its first frame
-    again, marked in `SEGMENT_PADDING_KEY`.
+    With `memory.segments` each field has an axis of time: the frames at which the policy writes, and its own;
+    before the episode's beginning its first frame, marked in `SEGMENT_PADDING_KEY`.
     """
 
     def __init__(self, source: LeRobotDataset, memory: SampleMemory, **options: Any) -> None:

@@ -194,10 +194,7 @@ def replay_actions(
     heartbeat: Callable[[Stage], None],
     with_pictures: bool,
 ) -> EpisodeLog:
-    """Execute recorded actions, (n_steps, A); return all results, from reset on.
-
-    With images, every observation before an action has them, from an environment that has cameras.
-    """
+    """Execute recorded actions, (n_steps, A); return all results, from reset on."""
     log = EpisodeLog(n_images=len(actions) if with_pictures else 0)
     settings = RolloutSettings(chunking=ONE_BY_ONE)
     rollout(env, RecordedActions(actions), [start], settings, observers=[log], heartbeat=heartbeat)

@@ -93,10 +93,7 @@ class ShardJob(_TaskJob):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JoinJob(_TaskJob):
-    """Put all shards of a task together at `path`; the answer is a `DatasetWritten`.
-
-    Its draft is written in the folder of the shards; `facts` are without counts and digests.
-    """
+    """Put all shards of a task together at `path`; `facts` are without counts and digests."""
 
     path: Path
     shards: tuple[Path, ...]

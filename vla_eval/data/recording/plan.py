@@ -33,15 +33,7 @@ class RecordingPlan:
 
 
 def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
-    """Find what can be wrong with a recipe before a simulator is started.
-
-    Raises:
-        UnknownNameError: a task, expert or prompt set does not exist.
-        RecipeError: the expert's recipe is wrong, or the video encoder refuses its settings.
-        MissingInstructionError: a task has no instruction.
-        TaskArgumentError: see `describe_env`.
-        CheckpointError: the expert's weights are not there.
-    """
+    """Find what can be wrong with a recipe before a simulator is started."""
     check_encoder(recipe.encoder)
     expert = load_recipe("policies", recipe.expert, PolicyRecipe)
     check_adapter(expert.value.adapter)

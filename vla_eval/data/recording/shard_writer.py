@@ -1,8 +1,7 @@
 """Write episodes as small LeRobotDatasets that appear whole or not at all, and put them together.
 
-lerobot loses a whole session when its process is killed, so a shard is written under another name,
-finalised, made durable and then renamed. Encoding goes through `LeRobotDataset` alone. Knows nothing of
-simulators: it is given frames.
+lerobot loses a whole session when its process is killed, so a shard is written under another name, made
+durable and then renamed. Knows nothing of simulators: it is given frames.
 """
 
 from collections.abc import Iterable, Sequence

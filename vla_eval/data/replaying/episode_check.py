@@ -73,10 +73,7 @@ def check_pictures(
     expect_equal_bits: bool,
     min_psnr_db: float,
 ) -> ImageCheck:
-    """Compare rendered images with the manifest's digests, and the video with the images.
-
-    `frames` has the images per step, `decoded` those of the video per camera.
-    """
+    """Compare rendered images, by step, with the manifest's digests, and the video, by camera, with both."""
     found = []
     fresh = images_digests(frames)
     if expect_equal_bits:

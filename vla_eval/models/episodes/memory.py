@@ -50,8 +50,7 @@ def recall(
 ) -> Memory:
     """Return the memory (B, …) after all unseen frames of the episodes in the rows.
 
-    `preprocess` makes the batch that the policy reads of frames (T, …) or (…), one per row. `remember` may
-    change the memory that it is given in place.
+    `preprocess` makes the policy's batch of frames (T, …) or (…), one per row. `remember` may work in place.
     """
     singly = remembers_singly(policy)
     first = policy.begin_memory(len(rows))

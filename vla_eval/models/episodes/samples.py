@@ -119,10 +119,7 @@ def episodes_of(
 
 
 def count_motions(actions: Tensor, real: Tensor) -> Tensor:
-    """Return (B,): how often the arm begins to move, from rest or from where it has slowed down.
-
-    An action (B, T, action) begins with a translation of the tool; nothing moves in padding, `real` False.
-    """
+    """Return (B,): how often the arm begins to move; actions (B, T, action) begin with a translation."""
     sizes = actions[..., :SPACE].norm(dim=-1) * real
     rises = sizes.diff(dim=1, prepend=torch.zeros_like(sizes[:, :1]))
     n_motions: Tensor = (rises > MOTION_BEGINS).sum(dim=1)

@@ -57,10 +57,7 @@ def word_rows(sentence: str) -> list[int]:
 def said_at_each_step(
     encoder: SentenceEncoder | None, batch: Mapping[str, Any], n_steps: int
 ) -> Tensor | None:
-    """Return (B, T, outputs) of the sentences of B episodes, the same at each step.
-
-    None for a policy without an encoder, which reads none; each sentence has to have a word.
-    """
+    """Return (B, T, outputs) of the episodes' sentences, the same at each step; None without an encoder."""
     if encoder is None:
         return None
     sentences = batch.get(TASK_KEY)

@@ -51,10 +51,7 @@ class ActionHead(nn.Module):
             self.doubts.bias.fill_(-3.0)  # about the error of actions at the beginning
 
     def forward(self, decided: Tensor, way_m: Tensor) -> tuple[Tensor, Tensor]:
-        """Return actions (N, chunk, action), and the squared error expected of each (N, chunk) > 0.
-
-        They are of what was decided (N, hidden), and the way (N, 3) from the tool centre point to the goal.
-        """
+        """Return actions (N, chunk, action), and the squared error expected of each (N, chunk) > 0."""
         goes = self.goes(decided).sigmoid()[..., None]  # (N, chunk, 1)
         ways = self.way(self._along_each_axis(way_m)).transpose(1, 2)  # (N, chunk, 3)
         others = self.others(decided).reshape(len(decided), self.chunk, -1)

@@ -21,11 +21,7 @@ def prompt_text(instruction: str) -> str:
 
 
 def finished(ids: Tensor, mask: Tensor, sizes: NetworkSizes) -> Prompts:
-    """Return tokenised prompts (B, T), padded on the right, with the empty token at each one's end.
-
-    Raises:
-        SpecMismatchError: a prompt does not begin as the model's tokenizer begins it.
-    """
+    """Return tokenised prompts (B, T), padded on the right, with the empty token at each one's end."""
     if not bool((ids[:, 0] == sizes.bos_token).all()):
         raise SpecMismatchError(
             f"OpenVLA's prompts begin with the token {sizes.bos_token}, found {ids[:, 0].tolist()}. The "

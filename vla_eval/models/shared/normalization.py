@@ -52,11 +52,7 @@ class Normalization:
 
 
 class Normalizer:
-    """A `Normalization` with its statistics: name -> one number per dimension.
-
-    Raises:
-        CheckpointError: a statistic is missing, of another size, or not finite; `where` is in the message.
-    """
+    """A `Normalization` with its statistics: name -> one number per dimension."""
 
     def __init__(self, spec: Normalization, statistics: Mapping[str, Any], *, where: str) -> None:
         self.spec = spec

@@ -22,10 +22,6 @@ def finished(ids: Tensor, mask: Tensor, sizes: NetworkSizes) -> Prompts:
     """Return tokenised prompts (B, T), padded on the right, with the beginning of text before each.
 
     Some tokenizers put that token there by themselves, others do not; both come to the same.
-
-    Raises:
-        SpecMismatchError: a prompt does not end with the model's newline, or holds tokens of images
-            or actions: the tokenizer is not the model's.
     """
     keep = mask.bool()
     last = ids.gather(1, (keep.sum(dim=1, keepdim=True) - 1).clamp(min=0))[:, 0]

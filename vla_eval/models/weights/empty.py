@@ -21,8 +21,7 @@ _patching = threading.Lock()
 def empty_weights() -> Iterator[None]:
     """Let modules that are built in this context have their parameters on torch's `meta` device.
 
-    A parameter that two modules share stays one. Moving such a module to a device moves its buffers alone.
-    Not for several threads at once: torch's own classes are patched within the context.
+    A parameter that two modules share stays one. Not for several threads: torch's classes are patched.
     """
     with _patching:
         nn.Module.register_parameter = _register_empty  # type: ignore[method-assign]

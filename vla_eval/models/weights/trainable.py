@@ -58,10 +58,7 @@ def check_lora_target(target: str | None) -> None:
 
 
 def check_lora(model: Any, target: str, full_modules: Sequence[str] = ()) -> tuple[str, ...]:
-    """Check that what is trained is the adapters that `target` names, and `full_modules` by last names.
-
-    `model` is peft's wrapper around the policy; the names of the modules with an adapter are returned.
-    """
+    """Check that just `full_modules` and `target`'s adapters are trained; return the modules with one."""
     check_lora_target(target)
     inner = model.get_base_model() if hasattr(model, "get_base_model") else model
     linear = [name for name, module in inner.named_modules() if hasattr(module, "lora_A")]

@@ -22,10 +22,7 @@ https://github.com/haosulab/ManiSkill/blob/
 
 
 def as_rows(actions: Any) -> Any:
-    """Return a reply's actions as (T, A) float32, if they are numbers; anything else as it is.
-
-    A list becomes an array, one action a chunk of one, float64 float32. The loop refuses the rest.
-    """
+    """Return a reply's actions as (T, A) float32, if they are numbers; the loop refuses the rest."""
     if isinstance(actions, list):
         try:
             actions = np.array(actions)

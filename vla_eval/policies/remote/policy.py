@@ -104,13 +104,9 @@ class RemotePolicy:
 def make_remote(
     context: PolicyContext, *, url: str, identity_sha256: str | None = None, **args: Any
 ) -> RemotePolicy:
-    """Connect to a policy server; the other fields of `RemoteSettings` are in `args`.
+    """Connect to a policy server (of several with commas, the one with the fewest sessions).
 
-    Args:
-        context: what every adapter gets.
-        url: `ws://HOST:PORT`; of several with commas, the one with the fewest sessions is taken.
-        identity_sha256: digest of what the server reported when the run was planned; another is refused.
-        **args: see `RemoteSettings`.
+    A server whose digest is not `identity_sha256`, taken when the run was planned, is refused.
     """
     where = f"policy '{context.name}'"
     settings = remote_settings({"url": url, **args}, where=where)

@@ -29,13 +29,7 @@ class SurveyedPolicy(NamedTuple):
 
 
 def survey(args: Mapping[str, Any], *, policy: str) -> ServerMetadata:
-    """Return what the servers of a policy report, which has to be the same; `args` are the recipe's.
-
-    Raises:
-        RecipeError: an argument is wrong.
-        RemotePolicyError: a server is not there, or does not serve a policy.
-        RemoteChangedError: two servers are not of the same policy.
-    """
+    """Return what the servers of a policy report, which has to be the same; `args` are the recipe's."""
     return _survey(remote_settings(args, where=f"policy '{policy}'"))
 
 

@@ -22,10 +22,7 @@ def heat_maps(table: GridTable) -> dict[Group, list[HeatMap]]:
 
 
 def write_heat_maps(table: GridTable, folder: Path) -> list[Path]:
-    """Write a PNG file per task and phase, `OUT_TASK_delay.png`, and return their paths.
-
-    They go next to the folder, which holds run folders alone; errors as `write_beside`.
-    """
+    """Write a PNG file per task and phase, next to the folder of runs, and return their paths."""
     found = heat_maps(table)
     return write_beside(folder, {f"{task}_{axis}": heat_png(maps) for (task, axis), maps in found.items()})
 

@@ -16,10 +16,7 @@ CURVES: dict[str, str] = {
 
 
 def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
-    """Write a PNG file per task and kind of curve, such as `OUT_TASK_follows.png`, and return their paths.
-
-    They go next to the folder, which holds run folders alone; errors as `write_beside`.
-    """
+    """Write a PNG file per task and kind of curve, next to the folder of runs, and return their paths."""
     curves = by_kind(table.retention)
     return write_beside(folder, {f"{own[0].task}_{own[0].of}": retention_png(own) for own in curves})
 

@@ -79,11 +79,7 @@ class PublishedResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Published:
-    """The whole file.
-
-    Raises:
-        RecipeError: a result names a source, a board or a task that is not there.
-    """
+    """The whole file."""
 
     checked: str
     sources: dict[str, Reference]

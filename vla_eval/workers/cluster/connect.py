@@ -82,11 +82,7 @@ def connected(address: str) -> Iterator[Any]:
 
 
 def _without_working_directory(ray: Any) -> Any:
-    """Return Ray's settings of a job that does not import from the driver's working directory.
-
-    Ray searches it first for modules, unless the job has a folder of its own, which would be copied to each
-    machine. There is no public switch.
-    """
+    """Keep Ray from importing from the driver's working directory, for which there is no public switch."""
     config = ray.job_config.JobConfig()
     config._runtime_env_has_working_dir = lambda: True
     return config
