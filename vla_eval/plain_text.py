@@ -65,7 +65,6 @@ class PlainStream:
             self.write(line)
 
     def _put(self, text: str) -> None:
-        """Write text that is plain."""
         self._stream.write(text)
 
     def _plain(self, text: str) -> str:

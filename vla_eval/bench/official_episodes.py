@@ -1,7 +1,4 @@
-"""Run episodes with the official package's own runner: a script for the environment that it is installed in.
-
-It imports nothing of this package. The last line that it prints is JSON: how many steps, and seconds.
-"""
+"""Run episodes with the official package's own runner, in its environment; the last line is JSON."""
 
 import argparse
 import json

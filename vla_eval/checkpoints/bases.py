@@ -1,7 +1,4 @@
-"""Find a published checkpoint, and say how to get it: a base of recipes, or `hub:OWNER/NAME@REVISION`.
-
-Bases are rows of `models.families`. No network: `fetching` fetches them.
-"""
+"""Find a published checkpoint, a base of recipes or on the Hub, and say how to get it. No network."""
 
 import re
 from dataclasses import replace

@@ -1,7 +1,4 @@
-"""Make a LeRobot checkpoint of a published one, as its family's converter reads it. Knows no family.
-
-No code of the checkpoint is run. The result is a whole folder or none.
-"""
+"""Make a LeRobot checkpoint of a published one, by its family's converter; a whole folder or none."""
 
 import contextlib
 import json

@@ -70,7 +70,6 @@ def ignored_fields(
 
 
 def _ensembles(chunking: ChunkingSpec | None, decay: object) -> bool:
-    """Whether an evaluation does what ACT's temporal ensembling does."""
     return (
         chunking is not None
         and chunking.mode == "temporal_ensemble"

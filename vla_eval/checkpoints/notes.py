@@ -1,7 +1,4 @@
-"""What an evaluation notes of the weights that a policy's recipe names: digests, statistics, training seeds.
-
-Knows nothing of models, and does not import torch: planning an evaluation must not wait for it.
-"""
+"""What an evaluation notes of a policy's weights: digests, statistics, training seeds. Without torch."""
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path

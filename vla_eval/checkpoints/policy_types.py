@@ -1,7 +1,4 @@
-"""What the loop needs to know about a type of LeRobot policy, from its configuration and its family's row.
-
-A policy of your own says the same by attributes of its configuration.
-"""
+"""What the loop needs to know about a type of LeRobot policy: by its configuration and its family's row."""
 
 from typing import Any  # lerobot is untyped
 

@@ -1,7 +1,6 @@
-"""The description of a processor as a checkpoint has it: steps by name, their settings, their files.
+"""The description of a processor as a checkpoint has it: steps, settings, files. Read without torch.
 
-Says what such a file may hold, and reads it, without torch. Names are resolved, and steps made, by
-`processor_door`. Checkpoints from before LeRobot had processors are recognised here.
+Names are resolved, and steps made, by `safe_processors`.
 """
 
 import os

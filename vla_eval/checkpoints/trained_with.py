@@ -1,7 +1,4 @@
-"""What a policy was trained with, compared with what it is asked: one row per fact.
-
-Standard library only: planning an evaluation must not wait for torch. Knows nothing of models.
-"""
+"""What a policy was trained with, compared with what it is asked: one row per fact. Without torch."""
 
 import re
 from collections.abc import Iterable, Mapping, Sequence

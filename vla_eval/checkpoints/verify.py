@@ -1,7 +1,4 @@
-"""Check a LeRobot checkpoint by using it: weights, statistics, and one chunk of finite actions.
-
-Knows nothing of tasks: whether the actions are any good is for an evaluation to measure.
-"""
+"""Check a LeRobot checkpoint by using it: weights, statistics, and one chunk of finite actions."""
 
 from dataclasses import dataclass
 from pathlib import Path

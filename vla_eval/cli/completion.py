@@ -1,7 +1,4 @@
-"""`mikasa-vla completion`: print the completion of verbs, flags and names for a shell.
-
-Not by shtab: it completes no names by verb, and would be another dependency.
-"""
+"""`mikasa-vla completion`: print a shell's completion. Not by shtab, which completes no names by verb."""
 
 import argparse
 import re

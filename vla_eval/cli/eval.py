@@ -204,8 +204,6 @@ def _which(text: str, *, flag: str) -> str | int:
 
 
 def _config(args: argparse.Namespace) -> EvalConfig:
-    """Return the configuration: the file, flags on top of it, `--set` on top of those."""
-
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, RECIPE_FLAGS)
         if args.serve:

@@ -151,7 +151,6 @@ def finetune_with_progress(
 
 
 def _done(summary: "FinetuneSummary") -> int:
-    """Print the checkpoint, and the command that evaluates it."""
     from vla_eval.checkpoints.files import read_facts
     from vla_eval.cli.shared.output import hint_next
 
@@ -163,8 +162,6 @@ def _done(summary: "FinetuneSummary") -> int:
 
 
 def _config(args: argparse.Namespace) -> FinetuneConfig:
-    """Return the configuration: the file, flags on top of it, `--set` on top of those."""
-
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("dataset", "run_seed", "device", "out"))
         if args.policy is not None:

@@ -78,7 +78,6 @@ class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one message and exits with 1, as all users' mistakes do."""
 
     def error(self, message: str) -> NoReturn:
-        """Print the message and where to find help."""
         text = _with_short_words(message)
         self.exit(EXIT_USER_MISTAKE, f"{self.prog}: error: {text}\nSee `{self.prog} --help`.\n")
 

@@ -242,8 +242,6 @@ def _needed(configs: Sequence[EvalConfig]) -> tuple[Needed, ...]:
 
 
 def _config(args: argparse.Namespace) -> EvalConfig:
-    """Return the configuration that all worlds share: the file, the flags, `--set`."""
-
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("tasks", "policies", "n_action_steps", "episodes", "seed_start", "workers"))
         apply_overrides(data, args.overrides, cls=EvalConfig, free=env_paths(args.overrides))

@@ -165,8 +165,6 @@ def describe(dataset: "RecordedDataset") -> str:
 
 
 def _recipe(args: argparse.Namespace) -> DatasetRecipe:
-    """Return the recipe: the file, flags on top of it, `--set` on top of those."""
-
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("tasks", "episodes", "seed_start", "workers"))
         apply_overrides(data, args.overrides, cls=DatasetRecipe, free=env_paths(args.overrides))

@@ -55,7 +55,6 @@ class _ColumnNames:
     """The names of the columns, read when a help is shown: `mikasa-vla --help` need not wait for scipy."""
 
     def __str__(self) -> str:
-        """Return the names, from the left of the table."""
         from vla_eval.results.statistics import printed_columns
 
         return " ".join(printed_columns())
@@ -98,7 +97,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_published(args: argparse.Namespace) -> int:
-    """Print published results alone, without a run."""
     from vla_eval.errors import ReportError
     from vla_eval.results.table_formats import render_published
 

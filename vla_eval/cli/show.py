@@ -1,7 +1,4 @@
-"""`mikasa-vla show NAME`: a task (goal, scoring, arguments), a recipe's fields, or what a folder is.
-
-The task's source is read, not imported: importing it would start a simulator.
-"""
+"""`mikasa-vla show NAME`: a task, by its source, a recipe's fields, or what a folder is."""
 
 import argparse
 import os

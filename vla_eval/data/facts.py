@@ -1,7 +1,4 @@
-"""What a dataset of this project is: recorded, imported or mixed. A file in `meta/mikasa/`, written last.
-
-Knows nothing of lerobot.
-"""
+"""What a dataset of this project is: a file in `meta/mikasa/`, written last. Knows nothing of lerobot."""
 
 import hashlib
 from collections.abc import Mapping

@@ -1,7 +1,4 @@
-"""What `doctor` runs in another process: `python -m vla_eval.doctor.subprocess_checks NAME` prints JSON.
-
-Each function imports what it tests, because the import itself may fail or crash.
-"""
+"""What `doctor` runs in another process, as the import itself may crash; `… NAME` prints JSON."""
 
 import importlib
 import json

@@ -163,7 +163,6 @@ def _pushes(row: TaskSpec) -> bool:
 
 
 def _own(env: Any, name: str) -> Any:
-    """Return an attribute of an official environment."""
     try:
         return getattr(env, name)
     except AttributeError as exc:

@@ -1,7 +1,4 @@
-"""What adapters of ManiSkill environments share: images, the renderer's name, tensors as arrays.
-
-Torch ends here. Knows nothing of tasks.
-"""
+"""What adapters of ManiSkill environments share: images, renderer, tensors as arrays. Knows no tasks."""
 
 from typing import Any  # ManiSkill is untyped: its environments and tensors are Any here
 

@@ -96,7 +96,6 @@ def _movable(env: Any) -> dict[int, Any]:
 
 
 def _dynamic(env: Any) -> Iterator[Any]:
-    """Yield the physical bodies that forces move."""
     for actor in env.scene.actors.values():
         if actor.px_body_type == "dynamic":
             yield from actor._bodies

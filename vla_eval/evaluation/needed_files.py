@@ -1,7 +1,4 @@
-"""What the machines of a cluster must have before an evaluation begins: checkpoints, by path and digest.
-
-Recipes, prompts and settings travel with the episodes; small checkpoints are sent where they are missing.
-"""
+"""What a cluster's machines must have before an evaluation: checkpoints; the small ones are sent."""
 
 from collections.abc import Sequence
 from itertools import product

@@ -1,7 +1,4 @@
-"""What a person asks to be evaluated, with everything that was left open decided: made once, at the door.
-
-Plan, dry run, fingerprint, pool and cluster get a `ResolvedEvaluation`; none of them reads a policy again.
-"""
+"""What a person asks to be evaluated, with all that was left open decided: made once, at the door."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -127,7 +127,6 @@ class _InstalledOnly(importlib.abc.MetaPathFinder):
         self._trusted = [finder for finder in finders if finder is not importlib.machinery.PathFinder]
 
     def find_spec(self, fullname: str, path: Sequence[str] | None, target: Any = None) -> Any:
-        """Return the module's spec."""
         for finder in tuple(sys.meta_path):
             spec = None if finder is self else finder.find_spec(fullname, path, target)
             if spec is None:

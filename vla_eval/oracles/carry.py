@@ -133,7 +133,6 @@ def _grasp_place_m(play: _Play) -> model.Vector:
 
 
 def _command(play: _Play) -> tuple[model.Vector, float]:
-    """Return translation and gripper command."""
     arm = play.arm
     if not play.closing:
         place = _grasp_place_m(play)

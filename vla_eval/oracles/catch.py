@@ -88,7 +88,6 @@ class CatchExpert:
 
 
 def _decide(play: _Play) -> _Play:
-    """Switch to the next stage if its condition holds."""
     arm, stage = play.arm, play.stage
     offset = play.ball_m - arm.position_m[:2]
     if stage == "wait" and offset[1] > -START_LEAD_S * play.ball_velocity_m_s[1]:

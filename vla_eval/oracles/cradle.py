@@ -140,7 +140,6 @@ class CradleExpert:
 
 
 def _decide(play: _Play) -> _Play:
-    """Switch to the next stage if its condition holds."""
     tcp = play.arm.position_m
     behind_m = float(play.ball_m[1] - tcp[1])
     stage = play.stage

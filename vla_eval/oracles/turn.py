@@ -122,7 +122,6 @@ def _is_over(play: _Play) -> bool:
 
 
 def _command(play: _Play) -> tuple[model.Vector, float, float]:
-    """Return translation, turn and gripper command."""
     arm = play.arm
     if not play.closing:
         down = play.may_descend and _is_over(play)

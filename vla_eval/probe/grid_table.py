@@ -97,7 +97,6 @@ def grid_table(worlds: Sequence[GridWorld], records: Sequence[Sequence[EpisodeRe
 
 
 def _cells(runs: Sequence[_Run]) -> list[GridCell]:
-    """Return the cells of one task and phase."""
     keys = dict.fromkeys(key for _, found in runs for key in found)
     policies = list(dict.fromkeys(policy for policy, _ in keys))
     levels = dict.fromkeys(world.level for world, _ in runs)

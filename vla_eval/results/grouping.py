@@ -212,7 +212,6 @@ def _belongs(known: Mapping[int, EpisodeRecord], own: Mapping[int, EpisodeRecord
 
 
 def _is_same(one: EpisodeRecord, other: EpisodeRecord) -> bool:
-    """Whether two records with the same key are the same episode."""
     if "error" in (one.outcome, other.outcome):
         return one == other
     return one.trajectory_sha256 is not None and one.trajectory_sha256 == other.trajectory_sha256

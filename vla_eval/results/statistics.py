@@ -1,7 +1,4 @@
-"""The table of statistics: a row each. Whatever prints, writes or explains a statistic reads it from here.
-
-A new one is a `Statistic` and its entry in `STATISTICS`; `docs/statistics.md` explains it to the reader.
-"""
+"""The table of statistics, a row each, from which all is printed; docs/statistics.md explains them."""
 
 import math
 from collections.abc import Mapping, Sequence

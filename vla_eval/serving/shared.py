@@ -1,7 +1,4 @@
-"""Server processes of an evaluation: one per GPU of the backend, ended with their parent.
-
-Each is guarded like a worker: however the parent ends, its servers end with it.
-"""
+"""Server processes of an evaluation, one per GPU; guarded like workers, they end with their parent."""
 
 import functools
 import logging

@@ -1,7 +1,4 @@
-"""Which episodes a run has, by its configuration: what else is in its folder is not counted.
-
-Knows nothing of files.
-"""
+"""Which episodes a run has, by its configuration alone. Knows nothing of files."""
 
 import re
 from collections.abc import Collection, Mapping

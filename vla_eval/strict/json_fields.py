@@ -1,7 +1,4 @@
-"""The one reader of a checkpoint's JSON, which others wrote. Standard library only.
-
-It returns plain data, as strict as `json_text` makes it. The functions below return a field of one type.
-"""
+"""The one reader of a checkpoint's JSON, which others wrote, and of fields of one type. No packages."""
 
 import stat
 from collections.abc import Mapping

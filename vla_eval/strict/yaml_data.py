@@ -76,7 +76,6 @@ class _Reader:
         self.mark: _Mark = None  # where the parser has come to
 
     def document(self) -> Any:  # Any: plain data
-        """Return what the one document holds; None for an empty text."""
         self._events = yaml.parse(self._text, Loader=yaml.SafeLoader)
         self._next()  # the stream begins
         if isinstance(self._next(), yaml.StreamEndEvent):
@@ -166,7 +165,6 @@ class _Reader:
         return value
 
     def _admit(self, event: _Event, depth: int) -> None:
-        """Count one more value."""
         self._n_values += 1
         if depth > MAX_DEPTH:
             self._refuse(f"nested more than {MAX_DEPTH} deep", event)

@@ -1,7 +1,4 @@
-"""A checkpoint of random weights at a recipe's true size, as a fine-tuning would write it.
-
-Weights are made and written part by part. Tokenizers are stand-ins, since the published ones are not here.
-"""
+"""A checkpoint of random weights, made part by part, at a recipe's true size; tokenizers are stand-ins."""
 
 import contextlib
 import functools

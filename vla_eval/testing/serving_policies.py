@@ -1,7 +1,4 @@
-"""Policies to measure a policy server with: one that computes nothing, and a transformer with random weights.
-
-What they do means nothing; how long it takes and how it rounds does.
-"""
+"""Policies to measure a server with: one that computes nothing, and a transformer with random weights."""
 
 from collections.abc import Sequence
 from pathlib import Path

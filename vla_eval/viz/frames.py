@@ -1,7 +1,4 @@
-"""Compose the frames of a video: the cameras side by side, and facts about the step above them.
-
-They are above, because the controls of a player cover the lower edge.
-"""
+"""Compose the frames of a video: cameras side by side, facts above, where no player's controls are."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

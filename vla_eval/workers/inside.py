@@ -1,7 +1,4 @@
-"""The inside of any worker process: its heartbeat, its log, and the loop that answers jobs.
-
-Knows nothing of what a job is; that is the `Runner`'s.
-"""
+"""The inside of any worker process: its heartbeat, its log, the loop that answers jobs. Knows no jobs."""
 
 import ctypes
 import faulthandler

@@ -74,16 +74,13 @@ class _Count:
         self._write("begin")
 
     def tick(self) -> None:
-        """Write a line if it is time."""
         if "episodes_total" in self.state and self._lines.clock() - self._written >= EVERY_SECONDS:
             self._write("progress")
 
     def note(self, event: str, fields: dict[str, Any]) -> None:
-        """Write a line about something that has happened."""
         self._lines.write(event, {"run": self.state["run"], "phase": self.state["phase"], **fields})
 
     def end(self, *, stopped: bool) -> None:
-        """Write the last line, once."""
         if "episodes_total" in self.state and not self._is_ended:
             self._is_ended = True
             self.state["stopped"] = stopped

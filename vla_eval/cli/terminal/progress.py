@@ -149,7 +149,6 @@ class _BarAndLines[L: EvaluationLines | PhaseLines]:
         return self._stop.is_asked
 
     def close(self) -> None:
-        """Write how far it has come."""
         self._bar.close()
         self._lines.close(stopped=self._stop.is_asked)
 

@@ -33,7 +33,6 @@ class _Stream(PlainStream):
             self._meet(exc)
 
     def flush(self) -> None:
-        """Pass on what was written."""
         try:
             self._stream.flush()
         except OSError as exc:

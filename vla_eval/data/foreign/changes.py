@@ -1,7 +1,4 @@
-"""What is converted because the user asks for it: frame rate, size of images, gripper, bounds, sentences.
-
-Each change returns what it did as a sentence with numbers, which goes into the dataset's facts.
-"""
+"""What is converted because the user asks for it; each change returns a sentence for the facts."""
 
 import dataclasses
 from collections.abc import Callable, Mapping

@@ -1,7 +1,4 @@
-"""What a recording consists of, as data that is sent to workers: tries, shards, joins.
-
-Knows nothing of lerobot, simulators or processes.
-"""
+"""What a recording consists of, as data that is sent to workers: tries, shards, joins."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
@@ -56,7 +53,6 @@ class _TaskJob:
 
     @property
     def n_items(self) -> int:
-        """One seed, or one dataset."""
         return 1
 
 

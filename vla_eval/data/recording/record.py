@@ -209,7 +209,6 @@ class _Recorder:
     allow_environment_change: bool
 
     def record(self, task: TaskPlan, selection: Selection | None) -> RecordedDataset:
-        """Return the dataset of a task; made if it is not there yet."""
         begun = time.monotonic()
         path = self.folder.out / task.task
         if not (path / RECORDING_FILE).exists():  # a dataset appears only when it is complete

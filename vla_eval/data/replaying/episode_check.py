@@ -1,7 +1,4 @@
-"""Compare an episode that was done again with its record in a dataset. Knows nothing of simulators.
-
-Every function returns sentences, one per mismatch; none: all is as it should be.
-"""
+"""Compare an episode that was done again with its record in a dataset: a sentence per mismatch."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""How the episodes of a dataset begin: the arm's state and the images of the first frame, in any layout.
-
-Knows nothing of simulators.
-"""
+"""How the episodes of a dataset in any layout begin: the arm's state and the images of the first frame."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""What our policies that are trained on whole episodes share: memory from frame to frame, a queue of actions.
-
-Knows no network.
-"""
+"""What our policies on whole episodes share: memory from frame to frame, a queue of actions. No network."""
 
 import abc
 from collections import deque

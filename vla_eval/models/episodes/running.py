@@ -1,7 +1,4 @@
-"""What a LeRobot policy is given of running episodes: frames in time, seeds, noise, and a row of a pass.
-
-Knows nothing of how a policy infers or what it remembers.
-"""
+"""What a LeRobot policy is given of running episodes: frames in time, seeds, noise, a row of a pass."""
 
 import zlib
 from collections import deque

@@ -76,7 +76,6 @@ class MikasaMemoryPolicy(EpisodePolicy):
 
     @torch.no_grad()
     def _note_errors(self, answer: Answer, episodes: Episodes, real: Tensor) -> None:
-        """Tell the goal layer how far off each camera was."""
         missed = by_camera(answer.pointed_m, answer.shares) - episodes.goal_m[:, None, None]
         self.network.goal.note_errors(missed[real], answer.evidence[real], episodes.state[real])
 

@@ -1,7 +1,4 @@
-"""Encoder, actor and critics of offline reinforcement learning. Knows no loss.
-
-B is the batch, D the encoder's outputs, A an action's numbers, Q the critics, … any axes.
-"""
+"""Encoder, actor and critics (B batch, D encoder, A action, Q critics, … any axes). Knows no loss."""
 
 import copy
 from typing import NamedTuple

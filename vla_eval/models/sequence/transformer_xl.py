@@ -180,7 +180,6 @@ class TransformerXL(Segmented):
         return torch.cat([past, own.expand(len(n_cached), -1, -1)], dim=2)
 
     def _retained(self, memory: Tensor, written: Tensor) -> Tensor:
-        """Return the memory tokens after a segment."""
         if self.valve is not None:
             written = functional.relu(written)
             written, _ = self.valve(memory, written, written, need_weights=False)

@@ -62,7 +62,6 @@ class _Statistics(ProcessorStep):  # type: ignore[misc]  # lerobot is untyped
         }
 
     def state_dict(self) -> dict[str, Tensor]:
-        """Return the statistics that are used, by `field/statistic`."""
         return {
             f"{key}/{name}": values
             for key, normalizer in self._normalizers.items()

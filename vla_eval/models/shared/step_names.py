@@ -1,7 +1,4 @@
-"""Names of our processor steps in the files of a checkpoint. Knows nothing, not even torch.
-
-A loader, a training loop and the notes of an evaluation read them there.
-"""
+"""Names of our processor steps in the files of a checkpoint. Knows nothing, not even torch."""
 
 from collections.abc import Mapping
 from typing import Literal

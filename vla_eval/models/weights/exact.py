@@ -173,7 +173,6 @@ def _take(
 
 
 def _is_same(actual: Tensor, expected: Tensor) -> bool:
-    """Whether two tensors are equal, in the type of the first."""
     pairs = zip(_parts(actual), _parts(expected), strict=True)
     return all(torch.equal(part.cpu(), other.cpu().to(part.dtype)) for part, other in pairs)
 

@@ -60,7 +60,6 @@ class _CandidateArm[Expert](ScriptedPolicy):
             self._in_view[episode.slot] = set()
 
     def act(self, window: ObservationWindow) -> ActionChunk:
-        """Hold until the choice can be made, then go."""
         state = self.privileged_state(window)
         self._in_view[window.slot].update(state.shown_candidates)
         if state.phase != "response":

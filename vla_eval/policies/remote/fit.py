@@ -1,7 +1,4 @@
-"""What is sent to a server and what comes back: the recipe, what the server says, and the environment in one.
-
-Every disagreement between the three is found here, before the first episode.
-"""
+"""Recipe, server and environment in one: what is sent and what comes back, or why they do not fit."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

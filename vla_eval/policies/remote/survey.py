@@ -1,7 +1,4 @@
-"""What planning asks of the servers of a policy: that they are there, and what they are.
-
-Nobody is waited for: a run that cannot start says so at once.
-"""
+"""What planning asks of a policy's servers: what they are. Nobody is waited for."""
 
 import re
 from collections.abc import Mapping

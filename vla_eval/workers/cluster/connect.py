@@ -1,7 +1,4 @@
-"""Connect to a Ray cluster, or start one on this machine. The only file that imports Ray.
-
-Ray is an engine here: its object store, dashboard and retries are not used.
-"""
+"""Connect to a Ray cluster, or start one; the only file that imports Ray, which is an engine here."""
 
 import contextlib
 import importlib
