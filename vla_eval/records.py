@@ -170,7 +170,8 @@ class EpisodeRecord:
         record = as_dataclass(cls, data, source)
         rule = broken_rule(record)
         if rule is not None:
-            raise source.refuse(shown_fields(record, rule), f"expected {rule.expected}")
+            found = ", ".join(f"{name} {getattr(record, name)!r:.80}" for name in rule.fields)
+            raise source.refuse(found, f"expected {rule.expected}")
         return record
 
 
@@ -367,8 +368,3 @@ def broken_rule(record: EpisodeRecord) -> Rule | None:
         if not rule.holds(record):
             return rule
     return None
-
-
-def shown_fields(record: EpisodeRecord, rule: Rule) -> str:
-    """Return `outcome 'failure', success_once True` for a message."""
-    return ", ".join(f"{name} {getattr(record, name)!r:.80}" for name in rule.fields)

@@ -80,16 +80,12 @@ def how_to_get(path: str | Path) -> str:
     return ""
 
 
-def first_fetch(recipe: str) -> str:
-    """Return a sentence with the command that fetches the base of a recipe; empty if it has none."""
-    base = base_of_recipe(recipe)
-    return "" if base is None else f" It starts from a base: first `mikasa-vla checkpoint fetch {base}`."
-
-
 def no_weights(recipe: str) -> CheckpointError:
     """Build the error for a recipe that says how a policy is trained, and has no weights yet."""
+    base = base_of_recipe(recipe)
+    first = "" if base is None else f" It starts from a base: first `mikasa-vla checkpoint fetch {base}`."
     return CheckpointError(
-        f"policy '{recipe}' has no weights: its recipe says how to fine-tune it.{first_fetch(recipe)} Run "
+        f"policy '{recipe}' has no weights: its recipe says how to fine-tune it.{first} Run "
         f"`mikasa-vla finetune --policy {recipe} --dataset DIR --out RUN`, then `mikasa-vla eval --policy "
         "RUN`; or name a folder with `checkpoint` in the recipe's args."
     )

@@ -165,7 +165,12 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("dataset", "run_seed", "device", "out"))
         if args.policy is not None:
-            data["policy"] = _one_policy(args.policy)
+            if len(args.policy) > 1:
+                raise RecipeError(
+                    f"--policy {' '.join(args.policy)}: expected one name; several are for a table of "
+                    "learned policies."
+                )
+            data["policy"] = args.policy[0]
         if args.allow_unreplayed:
             data["allow_unreplayed"] = True
         for path, value in (
@@ -192,11 +197,3 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
         needed={"policy": "--policy", "dataset": "--dataset"},
         example="finetune --policy act --dataset data/RememberColor3-v0 --steps 20000",
     )
-
-
-def _one_policy(names: list[str]) -> str:
-    if len(names) > 1:
-        raise RecipeError(
-            f"--policy {' '.join(names)}: expected one name; several are for a table of learned policies."
-        )
-    return names[0]

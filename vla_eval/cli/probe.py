@@ -70,13 +70,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--no-controls", action="store_true", help="run only the policies that are named")
 
 
-def _one_or_several(text: str) -> tuple[str, ...]:
-    return tuple(text.split(","))
-
-
 INTERVENTIONS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
     "--probe": (
-        *("probes", _one_or_several, "P"),
+        *("probes", lambda text: tuple(text.split(",")), "P"),
         "what to change, by spaces or commas (swap,blank,delay,reset)",
     ),
     "--swap": ("swaps", int, "K", "which other cues (1)"),

@@ -106,14 +106,10 @@ def cache_place(dataset: Path) -> str:
 def _check_screen(args: argparse.Namespace) -> None:
     from vla_eval.errors import ViewingError
 
-    if not args.print and not args.web and not _has_screen():
+    is_linux = sys.platform == "linux"
+    has_screen = not is_linux or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
+    if not args.print and not args.web and not has_screen:
         raise ViewingError(
             "There is no screen here (neither DISPLAY nor WAYLAND_DISPLAY is set). Use --web to look with a "
             "browser, or --print and open the files on another machine."
         )
-
-
-def _has_screen() -> bool:
-    if sys.platform != "linux":
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -49,8 +49,10 @@ def read_table(
             _check_size(path, file.metadata)
             schema = file.schema_arrow
             for column in schema:
-                if not (with_images and is_image(column.type)):
-                    _check_type(path, column.name, column.type)
+                is_plain = _is_plain(column.type, with_fields=column.name in LANGUAGE_COLUMNS)
+                if not is_plain and not (with_images and is_image(column.type)):
+                    found = f"{shown(column.name)} of the type {shown(str(column.type))}"
+                    raise refused(path, "columns of numbers, text, or lists of them", found)
             names = [name for name in schema.names if keep is None or keep(name)]
             if len(set(names)) != len(names):
                 raise refused(path, "columns of different names", f"{', '.join(names):.500}")
@@ -180,12 +182,6 @@ def _check_size(path: Path, metadata: Any) -> None:  # Any: pyarrow's
             f"{path}: takes {needed / MIB:.0f} MiB of memory, and {free / MIB:.0f} MiB are free. Select "
             "fewer episodes, or use a machine with more."
         )
-
-
-def _check_type(path: Path, name: str, kind: Any) -> None:  # Any: pyarrow.DataType
-    if not _is_plain(kind, with_fields=name in LANGUAGE_COLUMNS):
-        found = f"{shown(name)} of the type {shown(str(kind))}"
-        raise refused(path, "columns of numbers, text, or lists of them", found)
 
 
 def _is_plain(kind: Any, *, with_fields: bool = False) -> bool:  # Any: pyarrow.DataType

@@ -96,17 +96,7 @@ class Plan:
 
 
 def make_plan(resolved: ResolvedEvaluation) -> Plan:
-    """Plan the episodes of an evaluation, or of its shard.
-
-    Raises:
-        UnknownNameError: a task, policy, adapter or prompt set does not exist.
-        RecipeError: a recipe is wrong, two policies have the same name, there are too many episodes, or more
-            shards than blocks of episodes that stay together.
-        MissingInstructionError: a task has no instruction in the prompt set.
-        TaskArgumentError: see `describe_env`.
-        CheckpointError: the weights that a recipe names are not there, or not whole; or it has none yet.
-        SpecMismatchError: a checkpoint or a server predicts shorter chunks than are to be executed.
-    """
+    """Plan the episodes of an evaluation, or of its shard; a `VlaEvalError` if anything cannot be run."""
     config, policies = resolved.config, resolved.policies
     _refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
@@ -124,6 +114,8 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
     _refuse_too_many(config, groups)
+    limits = [policy.value.max_workers for policy in policies if policy.part(0) not in shared]
+    ignored = [ignored_fields(one.adapter, one.args, chunking=one.rollout.chunking) for one in groups]
     plan = Plan(
         jobs=tuple(job for group in groups for job in _jobs(config, group)),
         recipe_hashes=_recipe_hashes(prompts, policies, servers),
@@ -138,8 +130,8 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
         policy_names=tuple(dict.fromkeys(policy.name for policy in policies)),
         shared=shared,
         left_out=tuple(left_out),
-        max_workers=_max_workers(policies, shared),
-        ignored=_ignored(groups),
+        max_workers=min((limit for limit in limits if limit is not None), default=None),
+        ignored=tuple(dict.fromkeys(chain.from_iterable(ignored))),
     )
     return plan if resolved.shard is None else _shard_of(plan, config, resolved.shard)
 
@@ -168,7 +160,7 @@ def _groups_of_all(
     for task in tasks:
         describe_env(_env_settings(config, task))
         instruction = sentences_of(prompts, task)[0]
-        for policy in _on(task, policies):
+        for policy in (policy for policy in policies if policy.task in (None, task.id)):
             check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and not task.has_candidates:
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
@@ -216,11 +208,6 @@ def _noted[T](
     }
 
 
-def _ignored(groups: Sequence[EpisodeGroup]) -> tuple[str, ...]:
-    said = [ignored_fields(one.adapter, one.args, chunking=one.rollout.chunking) for one in groups]
-    return tuple(dict.fromkeys(chain.from_iterable(said)))
-
-
 def _sentences(
     policies: Sequence[PolicyEntry], servers: Mapping[str, ServerMetadata]
 ) -> dict[str, Sentences | None]:
@@ -236,15 +223,6 @@ def _sentences(
     ]
     there = {name: server.sentences for name, server in servers.items() if name not in has_none}
     return {**here, **there}
-
-
-def _max_workers(policies: Sequence[PolicyEntry], shared: Mapping[str, str]) -> int | None:
-    limits = [policy.value.max_workers for policy in policies if policy.part(0) not in shared]
-    return min((limit for limit in limits if limit is not None), default=None)
-
-
-def _on(task: TaskSpec, policies: Sequence[PolicyEntry]) -> list[PolicyEntry]:
-    return [policy for policy in policies if policy.task in (None, task.id)]
 
 
 def _check_tasks(tasks: Sequence[TaskSpec], policies: Sequence[PolicyEntry]) -> None:

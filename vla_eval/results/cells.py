@@ -5,6 +5,7 @@ import re
 from collections.abc import Sequence
 
 from vla_eval.plain_text import printable
+from vla_eval.strict.decoding import is_number
 
 FORMULA_SIGNS = ("=", "+", "-", "@", "\t", "\r", "\n")
 """First characters of a cell that a spreadsheet reads as a formula. Source: https://owasp.org/www-community/attacks/CSV_Injection"""
@@ -17,7 +18,7 @@ def csv_cell(value: object) -> object:
     """Return a value for a row of CSV: text that a spreadsheet would evaluate is prefixed with `'`."""
     if not isinstance(value, str):
         return value
-    is_formula = value.startswith(FORMULA_SIGNS) and not _is_number(value)
+    is_formula = value.startswith(FORMULA_SIGNS) and not (is_number(value) and value == value.strip())
     return f"'{printable(value)}" if is_formula else printable(value)
 
 
@@ -69,11 +70,3 @@ def html_table(titles: Sequence[str], rows: Sequence[Sequence[str]], is_number: 
 
 def _longest_run(text: str) -> int:
     return max((len(run) for run in re.findall("`+", text)), default=0)
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return text == text.strip()

@@ -73,7 +73,8 @@ def continued(
         logger.info("%s: the run grows: %s", shown, change)
     if growth:  # the command that makes the whole run is the newest
         known = replace(known, description=replace(description, environment=old.environment))
-    return known.with_session(replace(session, environment_changes=changes, plan_changes=growth))
+    session = replace(session, environment_changes=changes, plan_changes=growth)
+    return replace(known, sessions=(*known.sessions, session))
 
 
 def _check_unchanged(old: RunDescription, new: RunDescription, shown: Path, *, may_grow: bool) -> None:

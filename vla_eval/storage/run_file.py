@@ -110,10 +110,6 @@ class RunFile:
         known = groups if shard is None else shard.groups
         return PlannedEpisodes(config=config, groups=known, shard=shard)
 
-    def with_session(self, session: Session) -> "RunFile":
-        """Return this with one more session."""
-        return replace(self, sessions=(*self.sessions, session))
-
     def with_device(self, device: Mapping[str, JsonValue], changes: Sequence[Change]) -> "RunFile":
         """Return this with more known of the device, and with changes noted in the current session."""
         environment = {**self.description.environment, DEVICE: device}

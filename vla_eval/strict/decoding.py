@@ -213,12 +213,13 @@ def _wrong(path: str, expected: str, value: object) -> str:
     hint = ""
     if expected.startswith("a list") and isinstance(value, str):
         hint = f" Write it in brackets: [{value:.80}]."
-    elif "number" in expected and isinstance(value, str) and _reads_as_number(value):
+    elif "number" in expected and isinstance(value, str) and is_number(value):
         hint = " Write it without quotes or leading zeros, with a point and a sign in the exponent: 1.0e-3."
     return wrong(path, expected, value) + hint
 
 
-def _reads_as_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether Python reads a text as a number, blanks around it aside."""
     try:
         float(text)
     except ValueError:

@@ -53,14 +53,11 @@ class StepBatches(Sampler[list[Any]]):
         self._sampler, self._start, self._sharing, self._numbered = sampler, start, sharing, numbered
 
     def __iter__(self) -> Iterator[list[Any]]:
-        sharing, skipped = self._sharing, self._start.n_taken // self._per_step
+        sharing = self._sharing
+        skipped = self._start.n_taken // (sharing.batch_size * sharing.n_processes)
         for epoch in itertools.count(self._start.epoch):
             yield from itertools.islice(self._epoch(epoch, sharing), skipped, None)
             skipped = 0
-
-    @property
-    def _per_step(self) -> int:
-        return self._sharing.batch_size * self._sharing.n_processes
 
     def _epoch(self, epoch: int, sharing: Sharing) -> Iterator[list[Any]]:
         self._sampler.load_state_dict({"epoch": epoch, "start_index": 0})

@@ -205,10 +205,6 @@ def _seeds(pairs: Any) -> tuple[SeedRange, ...] | None:
     return tuple(SeedRange(first=first or 0, last=last or 0) for first, last in numbers)
 
 
-def _any_text(value: Any) -> str | None:
-    return value if isinstance(value, str) else None
-
-
 def _camera(value: Any) -> CameraImage | None:
     if not isinstance(value, Mapping) or _text(value.get("key")) is None:
         return None
@@ -238,7 +234,7 @@ _READERS = {
     "needs_session_id": _Reader("true or false", _flag),
     "batch_max": _Reader(f"a number from 1 to {MAX_SERVER_ROWS}", _count(1, MAX_SERVER_ROWS)),
     "supports": _Reader("a list of names", _names),
-    "versions": _Reader("a map of texts", _map_of(_any_text)),
+    "versions": _Reader("a map of texts", _map_of(lambda value: value if isinstance(value, str) else None)),
     "n_sessions": _Reader("a number ≥ 0", _count(0, MAX_COUNT)),
     "training_seeds": _Reader("a map of lists of first and last seeds", _map_of(_seeds)),
     "sentences": _Reader("a map of lists of texts", _map_of(_names)),

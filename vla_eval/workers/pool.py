@@ -89,7 +89,7 @@ class WorkerPool[J: Job, A]:
             worker = self._workers.get(index)
             if (worker is not None and worker.job is not None) or not queue.has_next():
                 continue
-            if worker is not None and worker.process.says_something():  # which an idle one does at its end
+            if worker is not None and worker.process.connection.poll():  # which an idle one does at its end
                 self._end(index)
                 worker = None
             taken = {other.loaded for other in self._workers.values() if other is not worker}

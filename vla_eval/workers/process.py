@@ -118,10 +118,6 @@ class WorkerProcess:
         """Return what it has sent; see `Inbox.read`."""
         return self._inbox.read()
 
-    def says_something(self) -> bool:
-        """Whether there is something to read: of an idle worker, that it has ended or gone wrong."""
-        return self.connection.poll()
-
     def busy(self) -> Busy:
         """Return what it is busy with; a `BrokenMessageError` after a stray write into its memory."""
         # The stage first, as `write_stage` writes it last.

@@ -145,15 +145,16 @@ class MikasaOpenVLAConfig(PromptedConfig):
 
     def lora_defaults(self) -> dict[str, Any]:
         """Return what LoRA trains unless a recipe says otherwise, in peft's words."""
-        full = [name for name in FULL_MODULES if self._has(name)]
+        full = [
+            name
+            for name, there in zip(FULL_MODULES, (self.head == "l1", self.use_proprio), strict=True)
+            if there
+        ]
         return {
             "target_modules": LORA_TARGETS,
             "modules_to_save": full or None,
             "init_lora_weights": "gaussian",
         }
-
-    def _has(self, module: str) -> bool:
-        return self.head == "l1" if module == "action_head" else self.use_proprio
 
     def get_scheduler_preset(self) -> Any:
         """Return the configuration of the schedule."""
