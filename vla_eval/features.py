@@ -92,13 +92,9 @@ def dataset_features(
 
 
 def proprioception(state: Mapping[str, FloatArray]) -> dict[StateKind, FloatArray]:
-    """Return both kinds of proprioception of an observation.
+    """Return both kinds of proprioception of an observation, float32: `eef` (10,), `joints` (25,).
 
-    Args:
-        state: `tcp_pose` (7,) position in m and wxyz quaternion, world frame; `qpos` (9,), `qvel` (9,).
-
-    Returns:
-        `eef` (10,) and `joints` (25,), float32; see `STATE_NAMES`.
+    `tcp_pose` (7,) is position in m and wxyz quaternion, world frame; see `STATE_NAMES`.
     """
     pose, qpos, qvel = state["tcp_pose"], state["qpos"], state["qvel"]
     if len(qpos) != len(JOINT_NAMES):

@@ -49,10 +49,7 @@ def kind_of(task: TaskSpec) -> Kind:
 
 
 def protocols_of(tasks: Sequence[str], wanted: Sequence[AuditProtocol]) -> tuple[AuditProtocol, ...]:
-    """Return the protocols under which tasks are audited: those wanted, or the official tasks' only one.
-
-    Tasks of this package together with official ones are refused.
-    """
+    """Return the protocols under which tasks are audited: those wanted, or the official tasks' only one."""
     official = {task: task_spec(task).is_official for task in tasks}
     if not any(official.values()):
         return tuple(wanted)

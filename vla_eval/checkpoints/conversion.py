@@ -32,11 +32,7 @@ TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 
 
 def convert(kind: str, source: Path, out: Path, options: Any) -> Path:
-    """Write the LeRobot checkpoint `out` with every parameter of the original and no other; return it.
-
-    Raises:
-        CheckpointError: something is missing, of another form, or not what the options say.
-    """
+    """Write the LeRobot checkpoint `out` with every parameter of the original and no other; return it."""
     check_free(out)
     original: Original = imported(FAMILIES[kind].converter)(source, options)
     policy = make_unfilled_policy(original.config)

@@ -65,11 +65,7 @@ def load_processor(
     to_output: Callable[[Any], Any] | None = None,
     make: type[Any] = DataProcessorPipeline,
 ) -> Any:
-    """Return the pipeline that a file of a checkpoint describes; everything it names lies in its folder.
-
-    `overrides`: step's name -> arguments that replace the saved ones; they are ours, and not checked. The
-    other arguments are lerobot's of a `DataProcessorPipeline`.
-    """
+    """Return the pipeline that a file describes, within its folder; `overrides`, ours, are not checked."""
     saved = read_saved_processor(path)
     classes = [resolve_step(step) for step in saved.steps]  # all of them, before the first is called
     for name in overrides:

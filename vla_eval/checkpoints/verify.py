@@ -59,11 +59,7 @@ class Verified:
 
 
 def check_structure(folder: Path) -> str:
-    """Compare names and shapes of a whole model's weights with the network, unread; return a line.
-
-    A base needs no statistics: a fine-tuning gives it those of its dataset. Types may differ from the
-    configuration's, since a recipe chooses the precision.
-    """
+    """Compare names and shapes of a whole model's weights, unread, with the network; return a line."""
     config = read_config(folder, LoadOptions(device="cpu"))
     policy = make_unfilled_policy(config, where=folder)
     file = folder / WEIGHTS_FILE

@@ -40,10 +40,7 @@ class PolicyRecipe:
 
 
 def load_policy(name: str) -> Recipe[PolicyRecipe]:
-    """Return the recipe of a policy; errors as `load_recipe`.
-
-    A former name gives its row of `configs/ablations.yaml`, with a warning.
-    """
+    """Return the recipe of a policy, by a former name with a warning; errors as `load_recipe`."""
     try:
         return load_recipe("policies", name, PolicyRecipe)
     except UnknownNameError:

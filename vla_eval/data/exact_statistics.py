@@ -68,10 +68,7 @@ def vector_statistics(rows: NDArray[np.generic]) -> Statistics:
 
 
 def image_statistics(histogram: Histogram, *, n_frames: int) -> Statistics:
-    """Return the statistics of a camera, levels scaled to [0, 1]; each value is (3, 1, 1), but `count`.
-
-    A quantile is the level at which that share of the pixels is reached.
-    """
+    """Return the statistics of a camera, levels scaled to [0, 1]; each value is (3, 1, 1), but `count`."""
     levels = np.arange(N_LEVELS) / (N_LEVELS - 1)
     total = histogram.sum(axis=1)
     weights = histogram / histogram.sum(axis=1, keepdims=True)
@@ -105,10 +102,6 @@ def usable_statistics(statistics: _Fields | None, features: _Fields) -> dict[str
       by minimum and maximum, which are never nearer (Popoviciu 1935). So the mean square of normalised
       demonstrations is of the order of 1, as it is with mean and standard deviation.
     - A range reaches at least the resolution to both sides of its middle.
-
-    Args:
-        statistics: of a dataset: field -> statistic -> numbers; None: it has none.
-        features: of the dataset: field -> `names` of its dimensions.
     """
     usable = {key: dict(values) for key, values in (statistics or {}).items()}
     for field in _fields(statistics, features):

@@ -66,14 +66,7 @@ class _Episode:
 
 
 class FakeEnv:
-    """Implements `SimEnv`; `n_renders` counts the observations that were rendered.
-
-    Args:
-        settings: `kwargs` may hold `horizon_steps` and `swap_cue`; `n_items`, `n_shown`, `cue_steps`,
-            `delay_steps`, `swap_order`, `shuffle_cue`, `cue_after_steps`, `show_cue`,
-            `freeze_until_choice`, `move_in_delay`, `distract_steps`, `strict_choice` for tasks with
-            candidates; `velocity_range_m_s` for the others.
-    """
+    """Implements `SimEnv` with the arguments of the defaults above; `n_renders` counts what was rendered."""
 
     def __init__(self, settings: EnvSettings) -> None:
         task = task_spec(settings.task)

@@ -197,12 +197,7 @@ def waiting_of(env: Any) -> Waiting:
 
 
 class OfficialEpisode:
-    """A running episode at the step that was noted last.
-
-    Attributes:
-        phase: the phase; what happens between cue and choice is a delay, also where mugs are shuffled.
-        candidates: where they are, and which is right; None for a task without.
-    """
+    """A running episode as noted last; what is between cue and choice is a delay, also where mugs move."""
 
     def __init__(self, row: TaskSpec, env: Any) -> None:
         """Begin with the state after a reset."""

@@ -70,10 +70,7 @@ def read_candidates(row: TaskSpec, env: Any, *, revealed: bool) -> Candidates | 
 def read_bodies(
     row: TaskSpec, env: Any, candidates: Candidates | None, first: Vector
 ) -> dict[str, BodyState]:
-    """Return the moving objects and places that the family's expert reads, by its names for them.
-
-    The environment is evaluated at this step; `first` (N, 3) is where peg or mugs were at the start.
-    """
+    """Return what the family's expert reads, by its names; `first` (N, 3) is where peg or mugs were."""
     if row.true_state == "ball":
         goal = {"goal": _place(_own(env, "goal_region"))} if hasattr(env, "goal_region") else {}
         return {"ball": _moving(_own(env, "ball")), **goal}

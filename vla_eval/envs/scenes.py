@@ -35,9 +35,6 @@ def share_vulkan(backend: str) -> None:
     Scenes without a renderer have materials, too. The first one makes an instance, which ends with the last:
     one per reset, half of its time. NVIDIA's driver refuses another after some tens
     (`ErrorIncompatibleDriver`). The first to render chooses the device, so that the shared one must be gone.
-
-    Args:
-        backend: of the environment that is made next, see `render_backend`.
     """
     if backend != "none":
         _kept.clear()

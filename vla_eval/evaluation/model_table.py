@@ -140,10 +140,7 @@ class ModelTable:
 
 
 def narrow(table: ModelTable, *, tasks: Collection[str] = (), rows: Collection[str] = ()) -> ModelTable:
-    """Return the part of a table that has these tasks and rows (none: all), in the table's order.
-
-    The folders are those of the whole table.
-    """
+    """Return the part of a table that has these tasks and rows (none: all), in its order and folders."""
     check_names("task", tasks, table.tasks, where=table.name)
     check_names("row", rows, [row.name for row in table.rows], where=table.name)
     chosen = tuple(task for task in table.tasks if not tasks or task in tasks)
@@ -281,11 +278,7 @@ def _write_recipe(out: Path, row: TableRow, task: str, run_seed: int, adapter: s
 
 
 def gpu_hours(row: TableRow, *, steps: int | None) -> float | None:
-    """Return a rough estimate of one fine-tuning's GPU hours, from operations alone; None without a cost.
-
-    Operations of a step over `SUSTAINED_TFLOPS`; loading and decoding are not counted. Good enough to
-    distinguish a day from a month.
-    """
+    """Return a rough estimate of one fine-tuning's GPU hours, from operations alone; None without a cost."""
     recipe = load_policy(row.policy).value.finetune
     if recipe is None:
         raise RecipeError(f"policies/{row.policy}.yaml has no section `finetune`: there is nothing to train.")

@@ -62,14 +62,7 @@ def advance(arm: ArmState, translation: Vector) -> ArmState:
 
 
 def advance_gripper(arm: ArmState, turn: float, gripper: float, *, held_width_m: float) -> ArmState:
-    """Return the arm with wrist and fingers one control step later.
-
-    Args:
-        arm: before the step.
-        turn: wanted turn in [-1, 1], positive counterclockwise seen from above (`turn_command`).
-        gripper: gripper command in [-1, 1].
-        held_width_m: width of the object between the fingers; they cannot close further.
-    """
+    """Return the arm one control step later; turn (counterclockwise) and gripper are in [-1, 1]."""
     turn_rad = arm.turn_rad + RESPONSE * (FULL_TURN_RAD_PER_STEP * turn - arm.turn_rad)
     wanted_m = 2 * (FINGER_LOW_M + (gripper + 1) / 2 * (FINGER_HIGH_M - FINGER_LOW_M))
     width_m = arm.width_m + FINGER_RESPONSE * (wanted_m - arm.width_m)

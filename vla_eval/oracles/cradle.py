@@ -1,12 +1,11 @@
 """Expert for Intercept: wait next to the ball's lane, let the ball into the fingers, push it to the goal.
 
 The gripper stays 3 cm open. Both fingers are aligned along y and hold the 4 cm ball like a cradle while
-it is pushed in +x. The ball keeps its own speed along y; the arm only adds speed along x.
+it is pushed in +x. The ball keeps its own speed along y, which decides where the arm meets it and how fast
+it pushes: one row of `CradleTactics` per mode.
 
-The ball's speed decides where the arm meets it and how fast it pushes: one row of `CradleTactics` per mode.
-
-The controller acts on a model of arm and ball that is advanced step by step. So it plans one action
-(closed loop) or many (open loop) in the same way. For the blind control, the ball exists only in the model.
+The controller acts on a model of arm and ball that is advanced step by step, for one action (closed loop)
+or many (open loop). For the blind control, the ball exists only in the model.
 """
 
 from dataclasses import dataclass, replace

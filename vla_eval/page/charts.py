@@ -85,11 +85,7 @@ def forest(
     width_px: float = FOREST_WIDTH_PX,
     label_px: float = 0,
 ) -> Chart:
-    """Draw rates with intervals, one below the other, chance and ceiling as ticks.
-
-    The description is for screen readers, `width_px` of the axis for a screen that is not narrow. `label_px`
-    is room for labels at least, so that the axes of several plots begin at the same place.
-    """
+    """Draw rates with intervals, one below the other, chance and ceiling as ticks."""
     label = f"{title}. {description}"
     with own_style():
         return Chart(

@@ -76,11 +76,7 @@ def text_width_px(text: str) -> float:
 
 
 def inline_svg(figure: Figure, *, label: str | None, css_class: str | None = None) -> Markup:
-    """Return a figure as an `svg` element; call it within `own_style`.
-
-    Its colors are of `PALETTE`, and nothing in it reaches beyond its axes. The label is for screen readers;
-    None for a decoration.
-    """
+    """Return a figure, drawn within `own_style`, as an `svg` element; without a label: a decoration."""
     file = io.StringIO()
     with _missing_glyphs_allowed():
         figure.savefig(file, format="svg", metadata=_NO_METADATA)

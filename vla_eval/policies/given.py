@@ -64,12 +64,8 @@ def make_given(context: PolicyContext, *, given: GivenPolicy) -> Policy:
 def given_entry(found: object, *, name: str | None = None) -> PolicyEntry:
     """Return an object as an entry of an evaluation.
 
-    Args:
-        found: an instance, or a class or function that makes one, from a `PolicyContext` or from nothing.
-        name: what records call it; None: as its class or function is called, an instance as its `spec` says.
-
-    Raises:
-        RecipeError: it is not a policy, cannot be copied to workers, or has a name that no record can have.
+    `found` is an instance, or a class or function that makes one, from a `PolicyContext` or from nothing.
+    Without a name it is called as its class or function, an instance as its `spec` says.
     """
     name = name or _name_of(found)
     check_recorded_name(name, kind="policy")

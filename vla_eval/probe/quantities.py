@@ -116,11 +116,7 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
 
 
 def _change_of(pairs: Sequence[Pair], spec: TaskSpec) -> ChangeOf | None:
-    """Return what a change is counted by, as far as the records know it.
-
-    The first touch, if the cue determines it; else the items touched, as many as are right; the final angle;
-    else the actions.
-    """
+    """Return what a change is counted by, as far as the records know it."""
     is_determined = pairs[0].drawn.target is not None or spec.memory == "sequential"
     if pairs[0].drawn.n_candidates and is_determined:
         return "choice"

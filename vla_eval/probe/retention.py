@@ -43,11 +43,8 @@ def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | Non
     """Return the half-life of a memory: delay in steps -> episodes, and the rate without memory.
 
     A decreasing curve is fitted to the rates (isotonic regression), and read between the delays by linear
-    interpolation.
-
-    Returns:
-        None if there are fewer than two delays, or if at the shortest one the cue is not followed more often
-        than by chance (one-sided exact binomial test at 0.05): then there is nothing to halve.
+    interpolation. None with one delay, or if at the shortest one the cue is not followed more often than by
+    chance (one-sided exact binomial test at 0.05): then there is nothing to halve.
     """
     delays = sorted(followed)
     if len(delays) < 2:
@@ -112,11 +109,7 @@ class Contrast(NamedTuple):
 
 
 def contrast(delay_steps: int, after: Followed, other: Followed) -> Contrast:
-    """Return the difference of two worlds with the same episodes in the same order: other minus after.
-
-    The interval is that of the bootstrap over seeds; where all draws are alike, it reaches from the least to
-    the most that both Wilson intervals allow.
-    """
+    """Return the difference, other minus after, of the same episodes; its interval is as in `share_left`."""
     per_episode = other.astype(float) - after
     low, high = _bootstrap(len(per_episode), lambda chosen: float(per_episode[chosen].mean()))
     if low == high:

@@ -109,11 +109,7 @@ def compare[K](pairs: Mapping[K, tuple[RowEpisodes, RowEpisodes]]) -> dict[K, Co
 def compare_with_baselines(
     groups: Mapping[RowKey, RowEpisodes], baselines: Sequence[str]
 ) -> dict[RowKey, tuple[Comparison | None, ...]]:
-    """Compare all rows with those of each baseline policy, on the same task, variant, run and seed.
-
-    No pair of policies is tested twice: a baseline is not compared with those before it. Rows that share no
-    episodes have None.
-    """
+    """Compare all rows with each baseline policy on the same task, variant, run and seed, no pair twice."""
     found = compare(
         {
             (baseline, key): (group, other)
@@ -146,11 +142,7 @@ def gather_evidence(
 def chance_of(
     key: RowKey, groups: Mapping[RowKey, RowEpisodes], successes: Mapping[RowKey, Success]
 ) -> Chance | None:
-    """Return the success of a policy without memory in the setting of this row.
-
-    It is that of the cue-blind arm on the same task, variant and `n_action_steps`, if it was run; otherwise
-    the value of the records or the catalogue (1/N for N candidates); None if there are no candidates.
-    """
+    """Return the success without memory in this row's setting: of the cue-blind arm, or else as stated."""
     blind = successes.get(key._replace(policy=CHANCE_POLICY), Success())
     if blind.success_once is not None and blind.ci_low is not None and blind.ci_high is not None:
         interval = Interval(blind.ci_low, blind.ci_high)

@@ -218,10 +218,7 @@ def _is_same(one: EpisodeRecord, other: EpisodeRecord) -> bool:
 
 
 def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
-    """Return for each run: task -> the settings that differ between the runs, None if none do.
-
-    Only what a run sets is named; it is `DEFAULT` where it sets none of them.
-    """
+    """Return for each run: task -> what it sets that differs between runs (nothing: `DEFAULT`), or None."""
     settings = [_settings(run) for run in runs]
     names = sorted({name for values in settings for name in values})
     differing = [name for name in names if len({values.get(name) for values in settings}) > 1]

@@ -36,10 +36,6 @@ def render(
     fit `width` (None: `FITS_CHARACTERS`); `wide`: all of them, and a row per run. `csv` and `json` have every
     column in full precision. The paper's results, or those of a published board, are marked and separate from
     the measured ones. The preset `paper` is LaTeX with tasks as columns and policies as rows.
-
-    Raises:
-        UnknownNameError: there is no such column or board.
-        ReportError: columns are selected for a format that has all of them, or a preset that it has not.
     """
     check_format(fmt, columns=columns, wide=wide, preset=preset, beside=paper or published is not None)
     sides = side_tables(table, paper=paper, published=published)

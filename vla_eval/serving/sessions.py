@@ -49,13 +49,7 @@ class Session:
 
 
 class SessionTable:
-    """All sessions of a server. Methods that take a request raise `RequestError` for what they refuse.
-
-    Args:
-        reads: whether the policy is given every frame or only the last one.
-        task: the task of an episode whose client names none.
-        forget: called with the slot of each session that is dropped.
-    """
+    """All sessions of a server. Methods that take a request raise `RequestError` for what they refuse."""
 
     def __init__(
         self,

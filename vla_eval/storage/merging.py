@@ -40,13 +40,7 @@ class MergedRun:
 
 
 def merge_runs(folders: Sequence[Path], *, allow_environment_change: bool = False) -> MergedRun:
-    """Read shards of one plan and put them together; nothing is written.
-
-    Raises:
-        MergeError: a folder is not a shard, two are the same one, or they are of different plans or, unless
-            that is allowed, environments.
-        RunFolderError: one is not a run folder, or a file in it is damaged.
-    """
+    """Read shards of one plan, compare them and put them together; nothing is written."""
     runs = [read_run(folder) for folder in folders]
     parts = [as_part(run.path, RunFile(description=run.description, sessions=run.sessions)) for run in runs]
     run_file = merge_descriptions(parts, allow_environment_change=allow_environment_change)
@@ -62,12 +56,7 @@ def merge_runs(folders: Sequence[Path], *, allow_environment_change: bool = Fals
 
 
 def write_merged(merged: MergedRun, out: Path) -> None:
-    """Write the run folder. Captures are linked, or copied where the file system cannot link.
-
-    Raises:
-        MergeError: there is something at `out`.
-        StorageFullError: it could not be written; nothing is left.
-    """
+    """Write the run folder, captures linked or copied; after an error nothing is left."""
     timings = {key: one for run in merged.runs for key, one in read_timings(run.path).items()}
     kept = [timings[record.key].to_json() for record in merged.records if record.key in timings]
     try:

@@ -16,10 +16,7 @@ _NAMED = re.compile(r"(?P<name>\w[\w.-]*)(?::(?P<task>\w[\w./-]*))?=(?P<checkpoi
 
 
 class NamedCheckpoints(NamedTuple):
-    """What `NAME=A,B,C` says: one policy whose runs 0, 1, 2 … are different checkpoints.
-
-    `NAME:TASK=A,B,C` says it for one task; the policy has another such entry for each further one.
-    """
+    """What `NAME=A,B,C` says, or `NAME:TASK=A,B,C`: a policy whose runs 0, 1, 2 … are these checkpoints."""
 
     name: str
     checkpoints: tuple[str, ...]

@@ -84,10 +84,6 @@ def starting(
 
     `own` are the files that a start writes into it, `purpose` is `a run folder`, for messages, and `check`
     refuses what is there already.
-
-    Raises:
-        RunFolderError: the folder cannot be used, or is in use.
-        StorageFullError: the disk is full.
     """
     let_write(path)
     try:

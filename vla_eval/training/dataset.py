@@ -52,11 +52,7 @@ def _to_replay(dataset: OpenDataset) -> str:
 
 
 def chosen_episodes(dataset: OpenDataset, recipe: FinetuneRecipe, policy: Any) -> OpenDataset:
-    """Return the dataset without the episodes that are not trained on.
-
-    Unless the recipe says otherwise, failed episodes are left out, except for a policy that is trained on
-    rewards, which distinguish them.
-    """
+    """Return the dataset without failed episodes, unless they are to be kept or the policy reads rewards."""
     reads_rewards = getattr(policy, "reward", None) is not None
     keeps = recipe.failed_episodes == "keep" or (recipe.failed_episodes is None and reads_rewards)
     if keeps or not dataset.failed:

@@ -50,18 +50,11 @@ def open_folder(
     check_steps: Callable[[int, int], None],
     ignore: frozenset[str] = frozenset(),
 ) -> Path | None:
-    """Make the folder of a run, or check that the one that is there is of the same run.
+    """Make the folder of a run, or check that the one there is of the same run; return where it resumes.
 
-    Args:
-        path: the folder.
-        settings: what results depend on; must be what it was.
-        record: further facts, written once.
-        check_steps: is called if nothing but the number of steps differs, with the number that there was and
-            the steps that are done; raises an error unless it may change.
-        ignore: files that may lie in a folder which is otherwise empty.
-
-    Returns:
-        The checkpoint to resume from; None to start from the beginning.
+    `settings` are what results depend on, and must be what they were; `record` are further facts.
+    `check_steps` is called if only the number of steps differs, with that number and the steps done.
+    Files of `ignore` may lie in an empty folder.
     """
     path.mkdir(parents=True, exist_ok=True)
     names = set(os.listdir(path))

@@ -36,10 +36,7 @@ def rrd_when_whole(
 def layout(
     cameras: Sequence[str], action_dims: Sequence[str], state_dims: Sequence[str] = ()
 ) -> rrb.Blueprint:
-    """Return the blueprint: the world and the cameras with images above, curves and words below.
-
-    `state_dims` are the entries of the proprioception; of datasets alone.
-    """
+    """Return the blueprint: the world and the cameras with images above, curves and words below."""
     views = [rrb.Spatial2DView(origin=f"cameras/{name}", name=name) for name in cameras]
     above = rrb.Horizontal(
         rrb.Spatial3DView(origin="world", name="world"),

@@ -53,15 +53,10 @@ class CodecError(ValueError):
 
 
 def packb(message: Any, text_markers: bool = False) -> bytes:
-    """Return a message as bytes.
+    """Return a message of maps, lists, text, bytes, numbers, None, numpy arrays and scalars as bytes.
 
-    Args:
-        message: maps with text as keys, lists, tuples, text, bytes, numbers, None, numpy arrays and scalars.
-        text_markers: write the markers of arrays as text, and scalars as plain numbers, for programs that
-            read nothing else.
-
-    Raises:
-        CodecError: it holds something else, or is too large.
+    `text_markers`: write the markers of arrays as text, and scalars as plain numbers, for programs that read
+    nothing else. A `CodecError` if it holds something else, or is too large.
     """
     try:
         data = msgpack.packb(_plain(message, 0, text_markers), use_bin_type=True)

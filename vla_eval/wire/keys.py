@@ -37,10 +37,7 @@ def key_headers(key: str | None) -> dict[str, str]:
 
 
 def refused(given: Sequence[str], key: str | None) -> HTTPStatus | None:
-    """Return the status with which a server with this key refuses a client; None if it is let in.
-
-    `given` are the values of all headers `Authorization`.
-    """
+    """Return the status with which a client of these headers `Authorization` is refused; None: let in."""
     if len(given) > 1:
         return HTTPStatus.BAD_REQUEST
     if key is None:

@@ -49,13 +49,7 @@ class RecordingFolder:
 
     @classmethod
     def open(cls, out: Path, description: RunDescription, *, allow_environment_change: bool) -> Self:
-        """Start a recording in a folder, or resume the one that is there.
-
-        Raises:
-            RunChangedError: recipe or environment are not what they were, and that is not allowed.
-            RunFolderError: another process records there, or the folder is somebody else's.
-            StorageFullError: the disk is full.
-        """
+        """Start a recording in a folder, or resume the one that is there."""
         state = out / STATE_FOLDER
         let_write(out)
 

@@ -61,13 +61,7 @@ class MergedRecording:
 
 
 def merge_recordings(folders: Sequence[Path], *, allow_environment_change: bool = False) -> MergedRecording:
-    """Read the parts of a recording, which `record --shard` has made; nothing is written.
-
-    Raises:
-        MergeError: a folder is not a part, two are the same one, or they are of different recipes or, unless
-            that is allowed, environments; or an expert has acted differently.
-        VlaEvalError: the recipe cannot be planned here; a file is damaged.
-    """
+    """Read the parts of a recording, made by `record --shard`, and compare them; nothing is written."""
     parts = [as_part(folder, RunFile.load(folder / STATE_FOLDER)) for folder in folders]
     run_file = merge_descriptions(parts, allow_environment_change=allow_environment_change)
     tasks = tuple(_merge_task(task, parts) for task in _plan(run_file, folders[0]))
@@ -76,12 +70,7 @@ def merge_recordings(folders: Sequence[Path], *, allow_environment_change: bool 
 
 
 def write_recording(merged: MergedRecording, out: Path) -> tuple[DatasetFacts, ...]:
-    """Write the recording, with its datasets if nothing is missing; else `record` resumes it.
-
-    Raises:
-        MergeError: there is something at `out`.
-        StorageFullError: it could not be written; nothing is left.
-    """
+    """Write the recording, which `record` resumes if anything is missing; after an error nothing is left."""
     try:
         with whole_folder(out, error=MergeError) as draft:
             for task in merged.tasks:

@@ -46,12 +46,9 @@ class Episode:
         return replace(self, frames=tuple(frames), unseen=tuple(unseen), earlier=earlier, step=step)
 
     def read(self, deltas: Sequence[int], *, masks_history: bool) -> Frame:
-        """Return the frame (…) that an inference reads, or the frames in time (T, …).
+        """Return the frame (…) that an inference reads, or the frames in time (T, …), 0 being the newest.
 
-        Args:
-            deltas: which frames, 0 being the newest; none: the newest, without an axis of time.
-            masks_history: add `FIELD_is_pad`, which marks what lies before the episode's beginning: there is
-                the first frame again, as in lerobot's datasets.
+        `masks_history` adds `FIELD_is_pad` for what lies before the episode: there is its first frame.
         """
         if not deltas:
             return self.frames[-1]

@@ -64,13 +64,9 @@ def episodes_of(
 ) -> Episodes:
     """Return the steps to train on, moved together: those of the episode, most waiting left out.
 
-    Args:
-        batch: as `config` asks for it by its delta indices; images in [0, 1], or bytes.
-        config: of the policy.
-        training: leave waiting out, end some episodes at a decision, change things and colours and move
-            images, at random by torch's generator; else take every step.
-        same_action: actions that differ by less are waiting.
-        may_stay: see `changed_things`.
+    In training, at random by torch's generator: waiting is left out, some episodes end at a decision, things
+    and colours change and images move. Otherwise every step is taken. Images are in [0, 1], or bytes; actions
+    that differ by less than `same_action` are waiting.
     """
     n_steps = config.n_window_steps
     real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]

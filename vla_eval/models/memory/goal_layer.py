@@ -90,11 +90,8 @@ class GoalLayer(nn.Module):
     def forward(self, places: Tensor, evidence: Tensor, state: Tensor) -> Goals:
         """Return the goals in metres.
 
-        Args:
-            places: (N, cameras, heads, 2) places in the images, -1 to 1.
-            evidence: (N, cameras, heads, 3) of each look-up, see `EVIDENCE_COUNTS`.
-            state: (N, state) in SI units: the tool centre point's position and the first two columns of its
-                rotation matrix.
+        `places` (N, cameras, heads, 2) are -1 to 1; for `evidence` see `EVIDENCE_COUNTS`. `state` (N, state)
+        begins with the tool's position and the first two columns of its rotation matrix.
         """
         mapped = [each(PLACE_SCALE * places[:, index]) for index, each in enumerate(self.maps)]
         pointed = torch.stack(

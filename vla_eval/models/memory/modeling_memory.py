@@ -115,11 +115,8 @@ def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
 
     An action is one if its error is expected to be larger by `UNFORESEEN` than that of the chunk's first
     action. A chunk that reaches beyond the moment at which the choice is shown cannot know where to go; the
-    mean of all demonstrations would send the arm to the middle. Held: no motion, the gripper as it was.
-
-    Args:
-        answer: for one step per episode.
-        holds_by_zero: whether an action of zeros holds the arm; otherwise the last one that is foreseen does.
+    mean of all demonstrations would send the arm to the middle. Held: no motion (zeros, or the last action
+    that is foreseen), the gripper as it was.
     """
     doubts = answer.doubts.sqrt()
     foreseen = (doubts <= doubts[:, :1] + UNFORESEEN).long().cumprod(dim=1)
@@ -131,17 +128,12 @@ def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
 
 
 def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor, Tensor]:
-    """Return by how much the goal of an answer is missed, and the loss that teaches it.
+    """Return by how much the goal of an answer (B, T) misses `right_m` (B, 3), and the loss that teaches it.
 
     Both are in units of what the mean of the batch's goals would miss, squared. In the loss each look-up
     answers for itself, in proportion to how far it is believed (Jacobs et al. 1991, "Adaptive Mixtures of
     Local Experts"): where only their mean has to be right, wrong ones that cancel out stay believed. And
-    each camera does: else the first to be any good is the only one that learns.
-
-    Args:
-        answer: for steps (B, T).
-        right_m: (B, 3).
-        real: (B, T) 1 for the steps that count, else 0.
+    each camera does: else the first to be any good is the only one that learns. `real` (B, T): what counts.
     """
     of_look_ups = (answer.pointed_m - right_m[:, None, None, None]).square().mean(dim=-1)
     of_cameras = (answer.shares * of_look_ups).sum(dim=-1)

@@ -207,12 +207,8 @@ class MemoryNetwork(nn.Module):
     ) -> Answer:
         """Answer for each step of padded episodes. Nothing is computed for padding but its memory.
 
-        Args:
-            images: (N, cameras, 3, H, W) in [0, 1], those of `first`, one episode after the other.
-            state: (B, T, state) in SI units.
-            said: (B, T, hidden), see `see`.
-            first: (B, T) where a frame is shown for the first time; later steps show it again.
-            real: (B, T) False for padding, which comes last and gets the answer of the step before it.
+        `images` (N, cameras, 3, H, W) in [0, 1] are those of `first` (B, T), where a frame is shown for the
+        first time. `state` (B, T, state) is in SI units. `real` (B, T) is False for padding, which is last.
         """
         sight = self.see(images, state[first], None if said is None else said[first])
         shown = last_of(first)

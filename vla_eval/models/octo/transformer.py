@@ -189,16 +189,11 @@ class OctoTransformer(nn.Module):
 
 
 def attention_mask(keys_BN: Tensor, n_task: int, n_steps: int) -> Tensor:
-    """Return (B, 1, N, N): who (third) may look at whom (fourth).
+    """Return (B, 1, N, N): who (third) may look at whom (fourth); the `n_task` tokens come first.
 
     The instruction looks at itself. A step's observation looks at the instruction and at observations of
     its own and earlier steps. A readout, the last token of its step, looks at all that, and at its own and
-    earlier readouts, which nothing else attends to. Nothing attends to padding.
-
-    Args:
-        keys_BN: False for padding.
-        n_task: tokens of the instruction, which come first.
-        n_steps: steps after it, all of the same number of tokens.
+    earlier readouts, which nothing else attends to. Nothing attends to padding (`keys_BN` False).
     """
     n_tokens = keys_BN.shape[1]
     place = torch.arange(n_tokens, device=keys_BN.device) - n_task

@@ -20,16 +20,11 @@ def bellman_loss(action_values: Tensor, target: Tensor) -> Tensor:
 
 
 def conservative_penalty(sampled: Tensor, log_densities: Tensor, recorded: Tensor) -> Tensor:
-    """Return by how much actions that were drawn look better than recorded ones: CQL(H).
+    """Return by how much drawn actions, with these log densities (B, N), look better than recorded: CQL(H).
 
     Kumar et al. 2020, "Conservative Q-Learning for Offline Reinforcement Learning", equation 4 with the
     maximum over actions estimated by importance sampling (appendix F); averaged over transitions, summed
-    over critics.
-
-    Args:
-        sampled: (Q, B, N) values of drawn actions.
-        log_densities: (B, N) of the distributions that they were drawn from.
-        recorded: (Q, B) values of the recorded actions.
+    over critics. Values are (Q, B, N) of drawn actions and (Q, B) of recorded ones.
     """
     return ((sampled - log_densities).logsumexp(dim=-1) - recorded).mean(dim=-1).sum()
 

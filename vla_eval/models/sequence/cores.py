@@ -142,11 +142,7 @@ def make_core(
     tokens_per_step: int = 1,
     given: Mapping[str, Any] | None = None,
 ) -> Core:
-    """Return the core of that name in `CORES`; see `core` for the sizes.
-
-    A layer of a transformer sees `context_steps` steps of `tokens_per_step` tokens, or a segment has so many.
-    `given`: fields of the core's options that differ from its row.
-    """
+    """Return the core of that name in `CORES`, with `given` options; see `core` for the sizes."""
     options, n_tokens = options_of(name, given or {}), context_steps * tokens_per_step
     stack: dict[str, Any] = {"width": width, "layers": layers, "dropout": dropout}
     if isinstance(options, TransformerXLOptions):

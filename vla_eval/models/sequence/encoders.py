@@ -162,13 +162,7 @@ LEAST_VARIANCE = 1e-5  # as torch's instance_norm
 
 
 def spatial_softmax(maps: Tensor, sharpness: Tensor, places: Tensor) -> Tensor:
-    """Return (N, maps, 3): x, y, and the map's own value there, each weighted by the softmax.
-
-    Args:
-        maps: (N, maps, P), the value of each map at each of P places.
-        sharpness: (maps,) by which normalised maps are multiplied before the softmax.
-        places: (P, 2) x and y.
-    """
+    """Return (N, maps, 3): x, y and value of maps (N, maps, P) at places (P, 2), weighted by the softmax."""
     found: Tensor = _SpatialSoftmax.apply(maps, sharpness, places)  # type: ignore[no-untyped-call]
     return found
 

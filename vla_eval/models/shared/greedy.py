@@ -36,13 +36,9 @@ class LanguageModel(Protocol):
         """Return the embeddings (B, T, D) of tokens (B, T)."""
 
     def read(self, embeddings: Tensor, mask: Tensor, places: Tensor, cache: DynamicCache | None) -> Tensor:
-        """Return the last hidden states (B, T, D); keys and values are added to the cache.
+        """Return the last hidden states (B, T, D) at places (1 or B, T); the mask is (B, T, T + cached).
 
-        Args:
-            embeddings: (B, T, D).
-            mask: (B, T, T with what the cache holds) bool.
-            places: (1 or B, T) int64.
-            cache: of the places before; None: there are none, and none are kept.
+        The cache of the places before gets their keys and values; None: nothing came before, nothing is kept.
         """
 
     def logits(self, hidden: Tensor) -> Tensor:

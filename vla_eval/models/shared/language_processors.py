@@ -51,11 +51,7 @@ def language_processors(
     *,
     fields: Mapping[str, Normalization] | None = None,
 ) -> tuple[Any, Any]:
-    """Return pre- and postprocessor of a policy, with the step that makes its prompts.
-
-    Without statistics by field, they come from a checkpoint. `fields`: how they are normalised with foreign
-    statistics; None: as the configuration says.
-    """
+    """Return pre- and postprocessor with a step for prompts; `fields`: normalised by foreign statistics."""
     named = config.tokenizer_name != BYTE_TOKENIZER
     tokenizer = {"tokenizer_name": config.tokenizer_name} if named else {"tokenizer": byte_tokenizer()}
     tokens = TokenizerProcessorStep(

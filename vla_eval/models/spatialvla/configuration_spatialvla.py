@@ -69,12 +69,7 @@ class LinearDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # le
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
 class MikasaSpatialVLAConfig(PromptedConfig):
-    """SpatialVLA.
-
-    Attributes:
-        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps: AdamW, and
-            `mikasa_linear_decay`.
-    """
+    """SpatialVLA, which is trained by AdamW with `mikasa_linear_decay`."""
 
     chunk_size: int = 4  # actions of a chunk, three tokens each
     n_action_steps: int = 4

@@ -76,13 +76,7 @@ def check_fit(
     cast: bool = False,
     may_be_new: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Compare names, shapes and types of tensors with the policy's; read no values.
-
-    The arguments and the errors are those of `put_weights`.
-
-    Returns:
-        Name in the policy -> name in the weights.
-    """
+    """Compare names, shapes and types as `put_weights` does; return name in the policy -> in the weights."""
     wanted: dict[str, Tensor] = dict(policy.state_dict(keep_vars=True))
     described = describe(weights)
     sources = _sources(policy, wanted, described)

@@ -98,11 +98,7 @@ class ChoicePolicy(_CandidateArm[CandidateExpert]):
 
 
 class VisitPolicy(_CandidateArm[VisitExpert]):
-    """Goes to several candidates: the right ones, as many drawn uniformly, or all of them.
-
-    An arm that knows none or only some of them knows how many were shown, and draws the others, and their
-    order.
-    """
+    """Goes to several candidates: the right ones, as many drawn uniformly where it knows none, or all."""
 
     def _go(self, window: ObservationWindow, state: PrivilegedState) -> NDArray[np.float32]:
         wanted, in_order = self._itinerary(window.slot, state)

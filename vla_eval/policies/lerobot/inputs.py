@@ -104,10 +104,7 @@ def check_training(
     *,
     policy: str,
 ) -> None:
-    """Compare what the policy saw in training with what it will see; raise with all that differs.
-
-    Without `facts`, which a fine-tuning of ours notes, its configuration and statistics are compared alone.
-    """
+    """Compare what the policy saw in training with what it will see; raise with all that differs."""
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
     seen = {field: sizes[camera] for camera, field in inputs.cameras.items()}
     config, preprocessor = loaded.config, loaded.preprocessor

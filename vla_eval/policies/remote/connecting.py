@@ -24,11 +24,7 @@ class Connected(NamedTuple):
 
 
 def connect_client(urls: Sequence[str], settings: RemoteSettings, *, connect_seconds: float) -> Connected:
-    """Connect to the server with the fewest sessions; of several with as few, the process number decides.
-
-    A worker of a cluster takes one of its own machine, if there is one. All servers are of the same policy,
-    so that no result depends on the choice.
-    """
+    """Connect to the server with the fewest sessions, of this machine if possible; all are the same."""
     near = [url for url in urls if urlsplit(url).hostname == os.environ.get(NEAR_VARIABLE)]
     connected = connect_all(near or urls, settings, connect_seconds=connect_seconds)
     n_sessions = [one.client.metadata.n_sessions or 0 for one in connected]
