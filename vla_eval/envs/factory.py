@@ -12,6 +12,7 @@ from vla_eval.core import SimEnv
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.envs.official_settings import check_official
 from vla_eval.errors import MissingDependencyError, unknown_name
+from vla_eval.lock.switch import own_need
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import check_arguments, offered_by, robot_uid
 from vla_eval.tasks.catalog import TASKS, task_spec
@@ -41,7 +42,8 @@ def make_env(settings: EnvSettings) -> SimEnv:
         factory_name = OFFICIAL
     module_name, _, attribute = factory_name.partition(":")
     try:
-        module = importlib.import_module(module_name)
+        with own_need():  # SAPIEN runs a program when it is imported
+            module = importlib.import_module(module_name)
     except ModuleNotFoundError as exc:
         if exc.name is None or exc.name.split(".")[0] == "vla_eval":
             raise
