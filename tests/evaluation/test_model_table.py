@@ -41,6 +41,7 @@ ROW = {"name": "one", "policy": "act", "n_action_steps": [4]}
 DRY_RUN = ("dry_run", "device_memory", "tflops")
 USED = {
     "eval": {
+        "dry_run",
         "out",
         "workers",
         "shard",
@@ -337,6 +338,18 @@ def test_no_flag_is_passed_over(
     verb, flag, *value = flags
     assert main([verb, str(small), flag, *value, "--out", str(tmp_path / "out")]) == 1
     assert f"{flag}: a table of learned policies sets this itself" in capsys.readouterr().err
+
+
+def test_a_dry_run_says_what_is_left_and_writes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["eval", "memory_table", "--policy", "diffusion", "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "5 fine-tunings (1 rows, 5 tasks, 1 run seeds), 0 of them finished" in said
+    assert main(["eval", "paper_vla_table", "--tiny", "--dry-run"]) == 1
+    assert "leave out --dry-run" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("verb", "refused"), [("eval", EVAL_FLAGS), ("finetune", FINETUNE_FLAGS)])

@@ -34,7 +34,7 @@ FINETUNE_FLAGS = (
     *("held_out_episodes", "overrides"),
 )
 EVAL_FLAGS = (
-    *("protocol", "dry_run", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
+    *("protocol", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
     *("seed_start", "runs", "overrides", "capture_video", "capture_rrd", "serve"),
 )
 """Flags that a table does not take, by the names of their values; `--task` and `--policy` choose a part."""
@@ -61,8 +61,7 @@ def describe_table(args: argparse.Namespace) -> list[str]:
 
     _refuse(args, FINETUNE_FLAGS)
     study = _study(args, rows=args.policy)
-    n_finished = len(finetunings(study.table, study.out)) - len(unfinished(study))
-    lines = [describe_effort(study.table, n_finished=n_finished)]
+    lines = [_effort(study)]
     first: dict[str, Finetuning] = {}
     for one in finetunings(study.table, study.out):
         first.setdefault(one.row.name, one)
@@ -73,14 +72,24 @@ def describe_table(args: argparse.Namespace) -> list[str]:
     return lines
 
 
+def _effort(study: Study) -> str:
+    n_finished = len(finetunings(study.table, study.out)) - len(unfinished(study))
+    return describe_effort(study.table, n_finished=n_finished)
+
+
 def evaluate_table(args: argparse.Namespace) -> int:
     """Evaluate every checkpoint and the controls, then print one table."""
     from vla_eval.cli.shared.output import check_baseline, check_table_arguments
 
     _refuse(args, EVAL_FLAGS)
     check_table_arguments(args)
+    if args.tiny and args.dry_run:
+        raise RecipeError("--tiny makes its models first: leave out --dry-run; all of it takes minutes.")
     study = _study(args, rows=args.policies)
     check_baseline(args.baseline, [*study.table.controls, *(row.name for row in study.table.rows)])
+    if args.dry_run:
+        print(_effort(study), f"Each is then evaluated on its task, {study.table.episodes} episodes per K.")
+        return 0
     with backend_of(args, needs=lambda: needed_files(study)) as backend:
         if args.tiny:
             _say(
