@@ -1,114 +1,144 @@
-"""Each command of README and docs is executed, on stand-ins for what it names; or it is listed why not.
+"""Each command of README and docs is executed, small, on stand-ins for what it names; or it is listed.
 
-`eval` is a dry run: it refuses what the run would refuse. Folders of checkpoints are copies of a shipped one,
-run folders copies of a small run on the fake simulator.
+`eval` and `finetune` are dry runs, which refuse what the run would refuse. Other verbs do all of it on the
+fake simulator, in this process.
 """
 
+import glob
 import itertools
-import shutil
+import re
+import shlex
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
-from tests.docs.test_docs_commands import OURS, ROOT, Command
+from tests.docs import stand_ins
+from tests.docs.test_docs_commands import ALL, ROOT
+from tests.serving.served_policies import Running
 from vla_eval.cli.main import main
-from vla_eval.config.files import list_recipes
-from vla_eval.evaluation.model_table import is_model_table
-from vla_eval.storage.planned import named_checkpoints
+from vla_eval.serving.host import HostOptions, host_policy
+from vla_eval.serving.server import ServerOptions
+from vla_eval.workers.in_process import IN_PROCESS
 
-NOT_EXECUTED = {
-    "audit": "simulates for hours; tests/audit",
-    "check": "is given a policy of its page; tests/cli/test_check.py",
-    "bench": "measures this machine; tests/bench",
-    "checkpoint": "reads published files or the network; tests/checkpoints",
-    "dataset": "reads recorded or published datasets; tests/data",
-    "finetune": "trains for hours; the names in it are looked up; tests/training",
-    "merge": "reads shards that other commands made; tests/cli/test_merge.py",
-    "probe": "simulates for hours; tests/probe",
-    "record": "simulates for hours; the names in it are looked up; tests/data",
-    "replay": "simulates; tests/data",
-    "serve": "runs until it is stopped; tests/cli/test_serve.py",
-    "view": "opens a viewer; tests/cli/test_view.py",
+NOT_EXECUTED: Mapping[str, str] = {
+    r"audit --suite .*|audit": "oracles of all tasks, which the fake simulator has not; tests/audit",
+    r"bench --against-official official.*": "the official package; tests/bench/test_official_bench.py",
+    r"bench( --against-official| --serve.*)?": "measures this machine; tests/bench",
+    r"checkpoint convert-.*": "original weights; tests/checkpoints/test_conversion.py",
+    r"checkpoint fetch .*|.*hub:.*": "the Hub; tests/checkpoints/test_fetching.py",
+    r"checkpoint merge .*": "an adapter of a trained VLA; tests/training/test_prompted_to_eval.py",
+    r"checkpoint rehearse .*": "a network of 450 million parameters; tests/testing/test_rehearsal.py",
+    r"dataset convert remember_.*": "the official demonstrations; tests/data/test_data_convert.py",
+    r"dataset convert .* --control-mode .*": "joints; tests/data/test_control_conversion.py",
+    r"dataset check-leak data/npz/.*": "states of the real simulator; tests/data/test_leak.py",
+    r"dataset mix data/many/.*": "ten tasks, some of which the fake simulator has not; two are mixed here",
+    r"dataset (push|pull) .*": "the Hub; tests/data/test_hub.py",
+    r"doctor --cluster .*|.* --cluster .*": "Ray; tests/evaluation/test_evaluate_on_cluster.py",
+    r"eval .*--json-progress .*": "an open file descriptor; tests/cli/test_json_progress.py",
+    r"eval paper_vla_table --tiny .*": "minutes; tests/evaluation/test_tiny_model_table.py",
+    r"eval .* remote_openpi@.*|eval .*ws://.* --set env.control_mode=.*|eval --task mikasa_vla/.*ws://.*": (
+        "a server of openpi with actions of joints; tests/docs/test_docs_released_policies.py"
+    ),
+    r"finetune .*base.checkpoint[ =]runs/decisions.*": (
+        "a trained sequence policy; tests/training/test_sequence_to_eval.py"
+    ),
+    r"merge .*-of-8.*": "eight shards; those of two are put together here",
+    r"probe .* --probe appearance .*": "what the fake simulator does not draw; tests/probe/test_probe.py",
+    r"probe probe|probe probe --set .*": "all changes of all tasks; tests/probe",
+    r"record .*--set env.control_mode=.*|record offline_rl .*": (
+        "joints, which the fake simulator has not; tests/data/test_record_maniskill.py"
+    ),
+    r"serve --policy pi05 .*": "fetched weights and a GPU; tests/cli/test_serve.py",
 }
-"""Verb -> why its commands are parsed only, and which tests run it at small scale."""
-NEEDED = {
-    "ws://": "a policy server; tests/evaluation/test_remote_runs.py",
-    "hub:": "the Hub; tests/checkpoints/test_fetching.py",
-    "--cluster": "Ray; tests/evaluation/test_evaluate_on_cluster.py",
-    "--filmstrip": "captured episodes; tests/viz",
+"""Command -> what it needs that is not here, and which tests run the like."""
+SLOW = (
+    r"audit .*strict.*|check (DIR --task|my).*|dataset convert data/npz.*|merge .*|record .*--shard .*"
+    r"|finetune (paper|ablations).*|finetune --policy (openvla|pi0|spatialvla).*|report .*--html.*"
+    r"|probe .*(=runs/|memory_|grid|probe --).*"
+)
+FINDINGS = {"dataset check data/foreign"}
+"""Commands that say by their exit code that something has to be changed: here the commands of the gripper."""
+SMALL: Mapping[str, tuple[str, ...]] = {
+    "audit": stand_ins.SMALL[:4],
+    "bench": ("--samples", "4", "--repeats", "1"),
+    "eval": ("--dry-run",),
+    "finetune": ("--dry-run",),
+    "probe": stand_ins.SMALL,
+    "record": (*stand_ins.SMALL, "--task", stand_ins.DEFAULT_TASK),
+    "view": ("--print",),
 }
-"""Part of a command -> what it needs, and which tests have it."""
+"""Verb -> what makes its commands small."""
+OURS = list(dict.fromkeys(shlex.join(one.words[1:]) for one in ALL if one.program == "mikasa-vla"))
 
 
-TABLES = "trained checkpoints; tests/evaluation/test_model_table.py"
-
-
-def why_not(command: Command) -> str | None:
+def why_not(command: str) -> str | None:
     """Return why a command is not executed here; None: it is."""
-    words = command.words
-    if words[1] == "eval" and not words[2].startswith("-") and is_model_table(words[2]):
-        return TABLES
-    needs = next((why for part, why in NEEDED.items() if any(part in word for word in words)), None)
-    return needs or NOT_EXECUTED.get(words[1])
+    return next((why for pattern, why in NOT_EXECUTED.items() if re.fullmatch(pattern, command)), None)
 
 
-EXECUTED = [command for command in OURS if why_not(command) is None]
+def small(command: str) -> tuple[str, ...]:
+    """Return the words of a command, small: on one task, without a viewer."""
+    text = re.sub(r"(?<=^record )(.*)--task( [\w-]+-v0)+", r"\1", command).replace(" --web", "")
+    words = tuple(shlex.split(text))
+    more = ("--episodes", "20") if words[0] == "record" and "--shard" in words else ()
+    return (*words, *SMALL.get(words[0], ()), *more)
 
 
-def test_every_verb_of_the_docs_is_executed_or_says_why_not() -> None:
-    executed = {command.words[1] for command in EXECUTED}
-    assert executed >= {"eval", "report", "compare", "list", "show"}
-    assert executed.isdisjoint(NOT_EXECUTED)
-    assert len(EXECUTED) > len(OURS) / 3
+ONCE = {re.sub(r"(?<=^record )(.*)--out \S+", r"\1", shlex.join(small(one))): one for one in OURS}
+"""Recordings that differ in their folder alone are made once."""
+EXECUTED = [
+    pytest.param(one, marks=[pytest.mark.slow] if re.fullmatch(SLOW, one) else [], id=one)
+    for one in ONCE.values()
+    if why_not(one) is None
+]
 
 
-def test_the_tests_that_are_named_instead_exist() -> None:
-    for why in (*NOT_EXECUTED.values(), *NEEDED.values(), TABLES):
-        assert (ROOT / "tests" / why.rpartition("tests/")[2]).exists(), why
+def test_what_is_listed_is_in_the_docs_and_names_a_test_that_exists() -> None:
+    assert [one for one in (*NOT_EXECUTED, SLOW) if not any(re.fullmatch(one, cmd) for cmd in OURS)] == []
+    for why in NOT_EXECUTED.values():
+        if "tests/" in why:
+            assert (ROOT / "tests" / why.rpartition("tests/")[2]).exists(), why
+    assert len(EXECUTED) > len(ONCE) * 3 / 4
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of the policies that pages compare with."""
-    folder = tmp_path_factory.mktemp("docs") / "run"
-    named = ("memoryless=hold", "memoryless_color3=hold", "memoryless_free=hold")
-    policies = ("random", "cue_blind", "oracle", *named)
-    own = ("--task", "RememberColor3-v0", "--episodes", "2", "--n-action-steps", "1", "4", "--workers", "1")
-    assert main(["eval", *own, "--policy", *policies, "--set", "simulator=fake", "--out", str(folder)]) == 0
-    return folder
+def server() -> Iterator[str]:
+    """Serve a shipped policy; return the port."""
+    hosted = host_policy(HostOptions(policy="memory_color3", max_batch=1))
+    running = Running(hosted, ServerOptions(host="127.0.0.1", port=0))
+    yield str(running.port)
+    running.stop()
+    running.wait()
 
 
-@pytest.mark.parametrize("command", EXECUTED, ids=str)
+@pytest.fixture(scope="module", autouse=True)
+def _in_this_process() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vla_eval.cli.shared.cluster.LOCAL", IN_PROCESS)
+        patch.setattr("vla_eval.cli.record.LOCAL", IN_PROCESS)
+        patch.setattr("vla_eval.serving.server.run_server", lambda *_, ready: ready(8000))
+        yield
+
+
+@pytest.mark.parametrize("command", EXECUTED)
 def test_a_command_of_the_docs_is_executed(
-    command: Command,
-    run: Path,
+    command: str,
+    request: pytest.FixtureRequest,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    verb, *words = command.words[1:]
-    for path in filter(_is_missing, _checkpoints(words) if verb == "eval" else ()):
-        shutil.copytree(ROOT / "checkpoints" / "memory_color3", path)
-        (Path(path) / "name.txt").write_text(path)  # each is another one
-    for path in filter(_is_missing, words if verb in ("report", "compare") else ()):
-        shutil.copytree(run, path)
-    code = main([verb, *words, *(("--dry-run",) if verb == "eval" else ())])
+    words = small(command)
+    if "ws://" in command:
+        names = itertools.cycle(("127.0.0.1", "localhost"))  # two names of one server
+        port = request.getfixturevalue("server")
+        words = tuple(re.sub(r"(?<=ws://)[\w.-]+:\d+", lambda _: f"{next(names)}:{port}", w) for w in words)
+    for path in stand_ins.missing(words):
+        stand_ins.put(words[0], path)
+    capsys.readouterr()
+    code = main([path for word in words for path in sorted(glob.glob(word)) or [word]])  # as a shell does it
     said = capsys.readouterr()
-    assert code == 0, said.err
+    assert code == (command in FINDINGS), said.err
     assert said.out
-
-
-def _checkpoints(words: list[str]) -> list[str]:
-    """Return what `--policy` names."""
-    after = words[words.index("--policy") + 1 :] if "--policy" in words else []
-    texts = list(itertools.takewhile(lambda word: not word.startswith("--"), after))
-    named = [named_checkpoints(text) for text in texts]
-    pairs = zip(texts, named, strict=True)
-    return [one for text, of in pairs for one in (of.checkpoints if of is not None else (text,))]
-
-
-def _is_missing(word: str) -> bool:
-    """Whether it is the path of a folder that a reader has and the test has not."""
-    is_path = "/" in word or word.isupper()
-    return is_path and not Path(word).exists() and word not in list_recipes("policies") and "=" not in word
