@@ -202,12 +202,15 @@ class StepObserver(Protocol):
 
     def wants_images(self, step: int) -> bool:
         """Whether the observation after `step` control steps must hold images for this observer."""
+        return False
 
     def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
         """Called once per episode with the reset observation."""
+        return
 
     def on_inference(self, episode: EpisodeStart, step: int, chunk: ActionChunk) -> None:
         """Called with each chunk that the policy returned for the observation at `step`."""
+        return
 
     def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
         """Called after each control step with the action asked for; `result` has the executed one."""

@@ -13,9 +13,8 @@ from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
 from vla_eval.probe.grid import GridSettings, GridWorld, plan_grid
-from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_table import grid_table
-from vla_eval.probe.grid_text import render_grid
+from vla_eval.probe.grid_text import grid_notes, grid_sentences, render_grid
 from vla_eval.probe.phases import fixed_phases, inferences
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.tasks.catalog import task_spec

@@ -20,7 +20,7 @@ from vla_eval.data.manifest import REPLAY_FILE, ReplayReport, manifest_sha256, w
 from vla_eval.errors import CheckpointError, DatasetError, RecipeError, SpecMismatchError, TrainingError
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.testing.tiny_models import TINY_POLICY, tiny_paligemma
-from vla_eval.training.cost.description import describe_model
+from vla_eval.training.cost.estimate import describe_model
 from vla_eval.training.dataset import training_dataset
 from vla_eval.training.finetune import finetune
 from vla_eval.training.policy_config import masks_padding, used_frames

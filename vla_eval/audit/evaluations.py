@@ -1,9 +1,4 @@
-"""Which tasks can be won without remembering? Run controls on each task; their counts give a verdict.
-
-There are two protocols for this package's tasks: `paper`, the tasks with their defaults, and `strict`, in
-which the arm is held until the choice and the first choice is final. The official package's tasks have one,
-`official`.
-"""
+"""Which tasks can be won without remembering? Run controls on each task; their counts give a verdict."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

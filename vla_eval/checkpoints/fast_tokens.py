@@ -1,9 +1,8 @@
 """The action tokenizer of π0-FAST, read as data; lerobot would run the Python code that lies beside it.
 
 Actions become the coefficients of a discrete cosine transform over time, rounded; each coefficient is a
-character, and a byte-pair encoding makes tokens of the string (Pertsch et al. 2025, "FAST: Efficient Action
-Tokenization for Vision-Language-Action Models", arXiv 2501.09747). The files are those of the published
-tokenizers: `processor_config.json` (`scale`, `min_token`) and a tokenizer of transformers.
+character, and a byte-pair encoding makes tokens of the string (Pertsch et al. 2025, arXiv 2501.09747). Files:
+`processor_config.json` (`scale`, `min_token`) and a tokenizer of transformers.
 """
 
 import json

@@ -39,9 +39,12 @@ def require_finished(root: Path) -> Facts:
             f"{root}: expected the folder of a dataset, found no {INFO_FILE} in it.{datasets_below(root)}"
         )
     *others, last = (str(kind.file) for kind in KINDS)
+    finish = "If another program made it: mikasa-vla dataset check shows how it can be used."
+    if (root / MIKASA_FOLDER).is_dir():
+        finish = "Run the command that makes it again: a recording resumes."
     raise DatasetError(
         f"{root}: not a complete dataset of this project: none of {', '.join(others)} and {last}, which "
-        f"are written last, is there. {_how_to_finish(root)}"
+        f"are written last, is there. {finish}"
     )
 
 
@@ -52,12 +55,6 @@ def datasets_below(root: Path) -> str:
     if not below:
         return " `mikasa-vla record` makes datasets; a recording that was stopped is resumed by its command."
     return f" Below it are {some_of(below)}. Name one."
-
-
-def _how_to_finish(root: Path) -> str:
-    if (root / MIKASA_FOLDER).is_dir():
-        return "Run the command that makes it again: a recording resumes."
-    return "If another program made it: mikasa-vla dataset check shows how it can be used."
 
 
 def check_dataset(root: Path) -> DatasetFacts:

@@ -96,12 +96,8 @@ def image_statistics(histogram: Histogram, *, n_frames: int) -> Statistics:
 def usable_statistics(statistics: _Fields | None, features: _Fields) -> dict[str, dict[str, Any]]:
     """Return statistics that a normalisation can divide by; other fields than state and action as they are.
 
-    - A standard deviation is at least the resolution.
-    - Quantiles that are nearer to their middle than the standard deviation leave out rare frames that lie far
-      away and would dominate a loss (a Gaussian's q01 is 2.3 deviations away, its q10 1.3). They are replaced
-      by minimum and maximum, which are never nearer (Popoviciu 1935). So the mean square of normalised
-      demonstrations is of the order of 1, as it is with mean and standard deviation.
-    - A range reaches at least the resolution to both sides of its middle.
+    docs/datasets.md has the rule. Quantiles that are nearer to their middle than the standard deviation are
+    replaced by minimum and maximum, which are never nearer (Popoviciu 1935).
     """
     usable = {key: dict(values) for key, values in (statistics or {}).items()}
     for field in _fields(statistics, features):

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
 from vla_eval.strict.json_text import shown
+from vla_eval.workers.start import available_ram_bytes
 
 EPISODE_TABLES = "meta/episodes/*/*.parquet"
 FRAME_TABLES = "data/*/*.parquet"
@@ -162,16 +163,6 @@ def check_values(path: Path, table: Any, names: Sequence[str]) -> None:  # Any: 
 def refused(path: Path, expected: str, found: str) -> DatasetError:
     """Build the error of a file of a dataset."""
     return DatasetError(f"{path}: expected {expected}, found {found}. {REMEDY}")
-
-
-def available_ram_bytes() -> int | None:
-    """Return how much RAM a process may still take without swapping, where Linux says so."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    return kib[0] * 1024 if kib else None
 
 
 def _check_size(path: Path, metadata: Any) -> None:  # Any: pyarrow's

@@ -1,12 +1,9 @@
 """Leave out of SAPIEN's shaders the one table that no task uses and that costs ten seconds per process.
 
-For reflections of an environment map, SAPIEN's shaders read a table (`samplerBRDFLUT`). SAPIEN computes it in
-each process when the first image is rendered: 9 to 10 s of a CPU core with Mesa's lavapipe. No task sets an
-environment map. The table is then multiplied by 0, the colour of an empty map, so images without it are equal
-to the bit. Knows nothing of tasks.
-
-The installed files are copied and changed: none of them is part of this package. If they are not as expected,
-SAPIEN uses them unchanged: slower, with the same images.
+SAPIEN computes it (`samplerBRDFLUT`, for reflections of an environment map) when a process renders its first
+image: 9 to 10 s of a CPU core with Mesa's lavapipe. No task sets an environment map; the table is then
+multiplied by 0, so images without it are equal to the bit. The installed files are copied and changed, or
+used unchanged if they are not as expected: slower, with the same images.
 """
 
 import functools

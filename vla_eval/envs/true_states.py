@@ -1,14 +1,8 @@
 """Keep what an environment shows apart from what is, where its `evaluate` writes poses.
 
-The official tasks show and hide objects by writing their poses in `evaluate`. On the GPU simulator such a
-write reaches the renderer and the success rule, but not the physics, which overwrites it at the next step. On
-the CPU simulator it moves the object: what was hidden 1000 m above the table falls, or is inside another body
-when it comes back. Here the true poses are remembered before `evaluate`, and put back before the next physics
-step.
-
-An object whose velocity `evaluate` also writes is not put back: with a pose and a velocity the code places it
-for good, as a battery that is returned to its slot. An object that is parked far above the table stays there:
-left alone, it would fall for 14 s and then hit the table. Knows nothing of single tasks.
+The true poses are remembered before `evaluate`, and put back before the next physics step, unless it also
+writes a velocity: then the object is placed for good. What is parked far above the table stays there.
+docs/official_suite.md says why. Knows nothing of single tasks.
 """
 
 import contextlib
@@ -66,7 +60,8 @@ class TrueStates:
     def _keep_parked(self) -> None:
         """Hold what is parked where it was parked first."""
         parked = {}
-        for body in _dynamic(self):
+        actors: Any = self.scene.actors.values()  # type: ignore[attr-defined]
+        for body in (body for one in actors if one.px_body_type == "dynamic" for body in one._bodies):
             key, pose = body.entity.per_scene_id, body.entity.pose
             if pose.p[2] > PARKED_ABOVE_M:
                 parked[key] = self._parked_poses.get(key, pose)
@@ -93,12 +88,6 @@ def _movable(env: Any) -> dict[int, Any]:
         if actor.px_body_type != "static"
         for entity in actor._objs
     }
-
-
-def _dynamic(env: Any) -> Iterator[Any]:
-    for actor in env.scene.actors.values():
-        if actor.px_body_type == "dynamic":
-            yield from actor._bodies
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -70,22 +70,16 @@ class EnvFacts(NamedTuple):
     n_candidates: int
 
 
-class _StepCount:
-    """Counts control steps for the parent, and says when a policy has inferred; implements `StepObserver`."""
+class _StepCount(StepObserver):
+    """Counts control steps for the parent, and says when a policy has inferred."""
 
     def __init__(self, heartbeat: Heartbeat, has_inferred: Callable[[], None]) -> None:
         self._heartbeat, self._has_inferred = heartbeat, has_inferred
 
-    def wants_images(self, _step: int) -> bool:
-        return False
-
-    def on_reset(self, _episode: EpisodeStart, _result: StepResult) -> None:
-        pass
-
-    def on_inference(self, _episode: EpisodeStart, _step: int, _chunk: ActionChunk) -> None:
+    def on_inference(self, episode: EpisodeStart, step: int, chunk: ActionChunk) -> None:
         self._has_inferred()
 
-    def on_step(self, _episode: EpisodeStart, _action: FloatArray, _result: StepResult) -> None:
+    def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
         self._heartbeat.count()
 
 

@@ -1,11 +1,10 @@
-"""The table of a grid as Markdown, CSV, JSON, LaTeX or an HTML table."""
+"""The table of a grid in every format, and in words: which drops chunk and phase explain."""
 
 import json
 from collections.abc import Sequence
 
-from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
 from vla_eval.probe.grid_table import GridCell, GridPart, GridTable
-from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate, success_json
+from vla_eval.probe.text_table import JsonRow, error_notes, rows_as_csv, shown_rate, success_json
 from vla_eval.results.formats import Format
 from vla_eval.results.own_statistics import rate
 from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of, write_tables
@@ -17,7 +16,13 @@ MOST_LISTED = 8  # first inferences whose steps fit into a cell
 def render_grid(table: GridTable, fmt: Format) -> str:
     """Return the table as text, without a newline at its end."""
     if fmt == "json":
-        return json.dumps(grid_json(table), indent=2, ensure_ascii=False, allow_nan=False)
+        report = {
+            "grid_version": GRID_VERSION,
+            "cells": [_json_cell(table, cell) for cell in table.cells],
+            "sentences": grid_sentences(table),
+            "notes": grid_notes(table),
+        }
+        return json.dumps(report, indent=2, ensure_ascii=False, allow_nan=False)
     if fmt == "csv":
         return rows_as_csv([_flat(cell, part) for cell in table.cells for part in (None, *cell.parts)])
     return write_tables([printed_grid(table)], fmt)
@@ -41,16 +46,6 @@ def printed_grid(table: GridTable) -> PrintedTable:
     ]
     said = [*grid_sentences(table), *grid_notes(table)]
     return PrintedTable(columns=columns, rows=cells_of(columns, table.cells), notes=said).folded()
-
-
-def grid_json(table: GridTable) -> JsonRow:
-    """Return cells and sentences as JSON; undefined values are null."""
-    return {
-        "grid_version": GRID_VERSION,
-        "cells": [_json_cell(table, cell) for cell in table.cells],
-        "sentences": grid_sentences(table),
-        "notes": grid_notes(table),
-    }
 
 
 def _json_cell(table: GridTable, cell: GridCell) -> JsonRow:
@@ -142,3 +137,71 @@ def _steps_of(parts: Sequence[GridPart]) -> str:
     """Return the steps of the cue with an inference, for each first inference: `0, 4; 1; 2; 3; none`."""
     listed = [", ".join(map(str, part.inferences.cue_steps)) or "none" for part in parts[:MOST_LISTED]]
     return "; ".join([*listed, *(["…"] if len(parts) > MOST_LISTED else [])])
+
+
+def grid_sentences(table: GridTable) -> list[str]:
+    """Return a sentence for each cell in which a policy succeeds less than in its best cell."""
+    by_policy: dict[tuple[str, str, str], list[GridCell]] = {}
+    for cell in table.cells:
+        if cell.reference is not None and cell.rate is not None:
+            by_policy.setdefault((cell.task, cell.axis, cell.policy), []).append(cell)
+    found = []
+    for cells in by_policy.values():
+        best = max(cells, key=lambda cell: cell.rate or 0.0)
+        found += [sentence for cell in cells if (sentence := _sentence(table, cell, best)) is not None]
+    return found
+
+
+def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
+    now, at_best = table.reference_of(cell), table.reference_of(best)
+    if not _is_below(cell, best) or now is None or at_best is None:
+        return None
+    drop = f"succeeds in {_rate(cell)} at {_where(cell)}, and in {_rate(best)} at {_where(best)}"
+    rates = f"succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase"
+    if not _is_below(now, at_best):
+        said = f"{rates} do not explain the drop"
+    elif _is_below(cell, now):
+        said = f"{rates} explain a part of the drop, not all of it"
+    else:
+        said = (
+            f"falls, too, from {_rate(at_best)} to {_rate(now)}: chunk and phase alone explain the drop, not "
+            "memory"
+        )
+    same = f"{now.policy}, which has the same inferences and forgets nothing,"
+    return f"{cell.policy} on {cell.task} {drop}; {same} {said}."
+
+
+def _is_below(one: GridCell, other: GridCell) -> bool:
+    """Whether the intervals of two rates do not overlap, and the first rate is the lower one."""
+    if one.interval is None or other.interval is None:
+        return False
+    return one.interval.high < other.interval.low
+
+
+def _where(cell: GridCell) -> str:
+    return f"K = {cell.n_action_steps}, {cell.axis} {cell.level}"
+
+
+def _rate(cell: GridCell) -> str:
+    return "no episode" if cell.rate is None else f"{cell.rate:.2f}"
+
+
+def grid_notes(table: GridTable) -> list[str]:
+    """Return the notes that a reader of the table needs, errors included."""
+    found = [
+        "Success once, over all first inferences; 95 % intervals (Wilson) count a seed as one episode. cue "
+        "frames: how many the policy is given (oracle reads the true state). late: steps of the response "
+        "before its first inference, whose actions were chosen before it. Each from the least to the most "
+        "over the first inferences.",
+    ]
+    controls = dict.fromkeys(cell.reference for cell in table.cells if cell.reference is not None)
+    if controls:
+        found.append(
+            "Same inferences: cue_reader for a policy that reads only the last frame (it knows what was in "
+            "view at its own inferences, and guesses the rest); oracle for one that reads every frame."
+        )
+    unknown = dict.fromkeys(
+        cell.policy for cell in table.cells if any(part.n_seen is None for part in cell.parts)
+    )
+    found += [f"{name}: no episode has a result, so that what it reads is not known." for name in unknown]
+    return [*found, *error_notes(table.n_errors)]

@@ -82,12 +82,9 @@ def mistakes(records: Sequence[EpisodeRecord], spec: TaskSpec) -> Mistakes | Non
 
 
 def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
-    """Return how many items are kept, corrected for guessing.
+    """Return how many items are kept, corrected for guessing (docs/probe.md), with the bootstrap's interval.
 
-    Of the first touches, as many as items were shown, some are right. A policy that keeps k of L items and
-    touches others of the N at random is right in k + (m - k) (L - k) / (N - k) of m touches, on average. The
-    number kept is the k with the mean that was found, 0 if guessing alone gives more. The interval is that of
-    the bootstrap over episodes. None if touches are not known, one item is right, or all of them are.
+    None if touches are not known, one item is right, or all of them are.
     """
     known = [found for record in records if (found := _touches(record)) is not None]
     if not known or any(not 1 < len(one.right) < one.n_candidates for one in known):

@@ -42,9 +42,8 @@ class HalfLife:
 def half_life(followed: Mapping[int, Followed], chance: float) -> HalfLife | None:
     """Return the half-life of a memory: delay in steps -> episodes, and the rate without memory.
 
-    A decreasing curve is fitted to the rates (isotonic regression), and read between the delays by linear
-    interpolation. None with one delay, or if at the shortest one the cue is not followed more often than by
-    chance (one-sided exact binomial test at 0.05): then there is nothing to halve.
+    docs/probe.md defines it. None with one delay, or if at the shortest one the cue is not followed more
+    often than by chance (one-sided exact binomial test at 0.05): then there is nothing to halve.
     """
     delays = sorted(followed)
     if len(delays) < 2:

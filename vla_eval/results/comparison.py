@@ -71,10 +71,9 @@ class Evidence:
 
 
 def success_of(group: RowEpisodes) -> Success:
-    """Estimate success once.
+    """Estimate success once: of several runs the mean of the run means.
 
-    The rate of several runs is the mean of the run means. If these are all equal, a t interval would have
-    zero width, as if there were no uncertainty; then the episodes of one run give the interval.
+    If these are all equal, the episodes of one run give the interval (docs/statistics.md).
     """
     runs = group.runs_with_results
     estimate = estimate_runs([run.rate for run in runs])

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import torch
 
-MEMINFO, CLEAR_REFS, STATUS = (Path("/proc") / name for name in ("meminfo", "self/clear_refs", "self/status"))
+CLEAR_REFS, STATUS = Path("/proc/self/clear_refs"), Path("/proc/self/status")
 
 
 def reset_peak() -> None:
@@ -23,14 +23,6 @@ def peak_rss_bytes() -> int:
             if line.startswith("VmHWM:"):
                 return int(line.split()[1]) * 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-
-
-def available_bytes() -> int | None:
-    """Return how much memory programs can still take; None where the kernel does not say."""
-    if not MEMINFO.is_file():
-        return None
-    fields = dict(line.split(":", 1) for line in MEMINFO.read_text().splitlines())
-    return int(fields["MemAvailable"].split()[0]) * 1024
 
 
 def reset_device_peak(device: str) -> None:

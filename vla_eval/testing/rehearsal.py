@@ -32,7 +32,6 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.testing.process_memory import (
-    available_bytes,
     peak_device_bytes,
     peak_rss_bytes,
     reset_device_peak,
@@ -40,10 +39,10 @@ from vla_eval.testing.process_memory import (
 )
 from vla_eval.testing.random_checkpoint import PART, TASK, built_tiny, stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsed import Estimated, Rehearsed, limit_bytes
-from vla_eval.training.cost.description import describe_model
-from vla_eval.training.cost.estimate import unfilled_model, with_adapters
+from vla_eval.training.cost.estimate import describe_model, unfilled_model, with_adapters
 from vla_eval.training.cost.sample_cost import sample_cost
 from vla_eval.training.request import load_finetune_recipe
+from vla_eval.workers.start import available_ram_bytes
 
 N_STEPS = 20
 GB = 1e9
@@ -130,7 +129,7 @@ class _Loading:
 def _measured(one: _Loading, before: int, estimated: Estimated, batches: Sequence[int]) -> Rehearsed:
     n_bytes = (one.folder / WEIGHTS_FILE).stat().st_size
     limit, device = limit_bytes(n_bytes), one.options.device
-    available = available_bytes()
+    available = available_ram_bytes()
     if device == "cpu" and available is not None and available < limit:
         raise CheckpointError(
             f"expected {limit / GB:.1f} GB of memory for this model, found {available / GB:.1f} GB "

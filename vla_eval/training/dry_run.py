@@ -5,24 +5,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
-import draccus
 from lerobot.configs import FeatureType, PolicyFeature
 
 from vla_eval.checkpoints.bases import how_to_get
 from vla_eval.checkpoints.files import find_checkpoint
-from vla_eval.checkpoints.foreign_code import only_data
 from vla_eval.checkpoints.loading import NO_DOWNLOADS, config_class
 from vla_eval.checkpoints.plain_errors import plain_errors
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.data.opening import OpenDataset
-from vla_eval.errors import CheckpointError, RecipeError
+from vla_eval.errors import CheckpointError
 from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE, STATE_KEY
 from vla_eval.models.families import bases
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.cost.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.dataset import chosen_episodes, training_dataset
 from vla_eval.training.lora import check_lora_targets
-from vla_eval.training.policy_config import asked_policy, fit_to_dataset, used_frames
+from vla_eval.training.policy_config import asked_policy, decoded_policy, fit_to_dataset, used_frames
 from vla_eval.training.request import load_finetune_recipe, run_folder_of
 from vla_eval.training.run_folder import newest_step
 
@@ -38,13 +36,7 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
     data = {**closed, **(base.fields if base else {}), **recipe.policy, "device": "cpu", "push_to_hub": False}
     if "action_grid" in known:
         data["action_grid"] = "uniform"
-    try:
-        with only_data():
-            policy: Any = draccus.decode(cls, data)
-    except CheckpointError:
-        raise
-    except Exception as exc:  # draccus and the policies raise what they like
-        raise RecipeError(f"finetune.policy: not a configuration of '{recipe.type}': {exc}") from exc
+    policy = decoded_policy(cls, data, recipe.type)
     height, width, n_colors = IMAGE_SHAPE
     image = PolicyFeature(type=FeatureType.VISUAL, shape=(n_colors, height, width))
     fields = {recipe.rename_cameras.get(name, name): image for name in CAMERA_KEYS.values()}

@@ -55,16 +55,21 @@ def asked_policy(recipe: FinetuneRecipe, cls: Any, base: Path | None, *, device:
     if recipe.tokenizer is not None and "text_tokenizer_name" in known:
         data["text_tokenizer_name"] = recipe.tokenizer  # π0-FAST itself loads it, too
     data.update(recipe.policy, device=device, push_to_hub=False)
+    return decoded_policy(cls, data, recipe.type)
+
+
+def decoded_policy(cls: Any, data: dict[str, Any], kind: str) -> Any:
+    """Return fields of a policy as lerobot's configuration of this class."""
     try:
         with only_data():  # some configurations open the backbone that they name
             return draccus.decode(cls, data)
     except CheckpointError:
         raise
     except OSError as exc:  # of a backbone that is not here
-        raise_plainly(exc, asked_for(cls, recipe.type, data))
+        raise_plainly(exc, asked_for(cls, kind, data))
     except Exception as exc:  # draccus and the policies raise what they like
         raise RecipeError(
-            f"finetune.policy: not a configuration of '{recipe.type}': {exc} {exc.__cause__ or ''}"
+            f"finetune.policy: not a configuration of '{kind}': {exc} {exc.__cause__ or ''}"
         ) from exc
 
 

@@ -1,15 +1,4 @@
-"""Write a taped episode as an `.rrd` for the rerun viewer, with a blueprint that lays it out.
-
-    cameras/NAME          images, at the steps where they were rendered
-    world/tcp, tcp_path   the tool centre point now, and all of its way
-    world/arm             a line through the joints of the arm, if it is the Panda's
-    world/candidates, bodies/NAME   where things are; `robot_base`
-    actions/DIM/executed, asked, predicted_I   I: chunks that overlap lie in different series
-    gripper/width, reward, phase/cue|delay|response (0 or 1), choice/first
-    events, instruction   in words
-
-Timelines: `step` (control steps) and `time` (seconds).
-"""
+"""Write a taped episode as an `.rrd` for the rerun viewer; docs/captures.md lists entities and timelines."""
 
 from collections.abc import Iterable, Sequence
 from itertools import pairwise

@@ -1,9 +1,8 @@
 """The process between a worker and its parent: ends all processes of the worker when the worker ends.
 
-A policy may start processes, even some that leave the worker's session and lose their parent (daemons).
-The guard is a *subreaper*: the kernel makes it the parent of every descendant that has lost its own. It
-ends them all when the worker or the parent ends, and then exits as the worker did. If the guard is
-killed, the kernel kills the worker.
+A policy may start daemons, which leave the worker's session. The guard is a *subreaper*: the kernel makes it
+the parent of every descendant that has lost its own. It ends them all when the worker or the parent ends, and
+exits as the worker did. If the guard is killed, the kernel kills the worker.
 """
 
 import contextlib

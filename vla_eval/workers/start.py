@@ -17,6 +17,7 @@ from concurrent.futures import Future
 from multiprocessing import forkserver, resource_tracker, spawn
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext, SpawnProcess
+from pathlib import Path
 from typing import Any  # private parts of multiprocessing
 
 from vla_eval.config.environment import Simulator
@@ -205,6 +206,16 @@ def worker_environment() -> Iterator[Mapping[str, str]]:
 def available_cores() -> int:
     """Return how many cores this process may use: of a machine's cores, clusters hand out a part."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def available_ram_bytes() -> int | None:
+    """Return how much RAM a process may still take without swapping, where Linux says so."""
+    try:
+        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+    except OSError:
+        return None
+    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
+    return kib[0] * 1024 if kib else None
 
 
 def visible_gpus() -> tuple[str, ...]:

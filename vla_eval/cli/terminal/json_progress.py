@@ -96,7 +96,19 @@ class _Count:
         self._lines.write(event, {**self.state, **times})
 
 
-class EvaluationLines:
+class _Lines:
+    _count: _Count
+
+    def on_tick(self) -> None:
+        """Write a line if it is time."""
+        self._count.tick()
+
+    def close(self, *, stopped: bool) -> None:
+        """Write the last line."""
+        self._count.end(stopped=stopped)
+
+
+class EvaluationLines(_Lines):
     """The lines of an evaluation; its methods are those of `EvaluationObserver`."""
 
     def __init__(self, lines: JsonLines, *, out: Path) -> None:
@@ -156,16 +168,8 @@ class EvaluationLines:
         if load.machines:
             state["machines"] = [asdict(machine) for machine in load.machines]
 
-    def on_tick(self) -> None:
-        """Write a line if it is time."""
-        self._count.tick()
 
-    def close(self, *, stopped: bool) -> None:
-        """Write the last line."""
-        self._count.end(stopped=stopped)
-
-
-class PhaseLines:
+class PhaseLines(_Lines):
     """The lines of a recording or a replay, phase by phase."""
 
     def __init__(self, lines: JsonLines) -> None:
@@ -185,11 +189,3 @@ class PhaseLines:
     def on_mismatch(self, sentence: str) -> None:
         """Write a line about it."""
         self._count.note("mismatch", {"message": sentence})
-
-    def on_tick(self) -> None:
-        """Write a line if it is time."""
-        self._count.tick()
-
-    def close(self, *, stopped: bool) -> None:
-        """Write the last line."""
-        self._count.end(stopped=stopped)

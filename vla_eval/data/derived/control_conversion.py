@@ -17,7 +17,15 @@ import numpy as np
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE, action_spec
-from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, ObservationWindow, SimEnv, Stage, StepResult
+from vla_eval.core import (
+    ActionChunk,
+    EpisodeStart,
+    FloatArray,
+    ObservationWindow,
+    SimEnv,
+    StepObserver,
+    StepResult,
+)
 from vla_eval.data.derived.changed_actions import copy_with_actions
 from vla_eval.data.derived.rebuild import failed_attempt
 from vla_eval.data.facts import read_facts
@@ -172,7 +180,7 @@ def convert_episode(
         aims, episode, old_mode=old.spec.action.control_mode, mode=new.spec.action.control_mode
     )
     start = plan.start(episode.seed, horizon_steps=new.spec.horizon_steps)
-    one = attempt(new, follower, start, plan.group.rollout, heartbeat=_ignore)
+    one = attempt(new, follower, start, plan.group.rollout, heartbeat=lambda _: None)
     if episode.intended_actions is not None:
         intended = new.spec.action.clipped(np.stack(follower.intended[: one.n_steps]))
         one = dataclasses.replace(one, intended_actions=encode_actions(intended))
@@ -196,22 +204,10 @@ def _aims(env: SimEnv, episode: RecordedEpisode) -> tuple[FloatArray, EpisodeLog
     return np.stack(noted.aims), log
 
 
-def _ignore(_stage: Stage) -> None:
-    """No watchdog listens: episodes are converted in the command's own process."""
-
-
-class _AimLog:
+class _AimLog(StepObserver):
     def __init__(self, env: JointAims) -> None:
         self._env = env
         self.aims: list[FloatArray] = []
-
-    def wants_images(self, step: int) -> bool:
-        return False
-
-    def _ignore(self, *_: object) -> None:
-        """Do nothing."""
-
-    on_reset = on_inference = _ignore
 
     def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
         self.aims.append(self._env.joint_targets(episode.slot))

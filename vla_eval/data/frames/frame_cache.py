@@ -22,9 +22,10 @@ from lerobot.datasets.video_utils import decode_video_frames
 
 from vla_eval.core import ImageArray
 from vla_eval.data.opening import UNREADABLE, reason
-from vla_eval.data.tables import MIB, available_ram_bytes
+from vla_eval.data.tables import MIB
 from vla_eval.errors import DatasetError, StorageFullError
 from vla_eval.storage.cache import cached
+from vla_eval.workers.start import available_ram_bytes
 
 FORMAT_VERSION = 1  # raised when the files' layout changes: old ones are then not found any more
 FRAMES_FOLDER = "frames"  # in the user's cache

@@ -22,6 +22,7 @@ from vla_eval.core import (
     Policy,
     SimEnv,
     Stage,
+    StepObserver,
     StepResult,
 )
 from vla_eval.data.manifest import decode_actions, encode_actions
@@ -50,8 +51,8 @@ class Attempt:
 
 
 @dataclass(slots=True)
-class EpisodeLog:
-    """A `StepObserver` that keeps all results of one episode, and asks for images of the first `n_images`."""
+class EpisodeLog(StepObserver):
+    """Keeps all results of one episode, and asks for images of the first `n_images`."""
 
     n_images: int = 0
     results: list[StepResult] = field(default_factory=list)
@@ -64,9 +65,6 @@ class EpisodeLog:
     def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
         """Keep the reset's result."""
         self.results.append(result)
-
-    def on_inference(self, episode: EpisodeStart, step: int, chunk: ActionChunk) -> None:
-        """Do nothing: actions are kept as they are executed."""
 
     def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
         """Keep action and result."""

@@ -68,7 +68,10 @@ def push_dataset(root: Path, repo_id: str, *, private: bool = False, api: HfApi 
             allow_patterns=names,
             delete_patterns=["data/**", "videos/**", "meta/**", "images/**"],
         )
-        _tag(api, repo_id, str(commit.oid))
+        # Without a tag of the format's version lerobot refuses the dataset.
+        with suppress(RevisionNotFoundError):  # the first push
+            api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type=REPO_TYPE)
+        api.create_tag(repo_id, tag=CODEBASE_VERSION, revision=str(commit.oid), repo_type=REPO_TYPE)
     return str(commit.commit_url)
 
 
@@ -106,13 +109,6 @@ def pull_dataset(
         ) from exc
     publish(partial, out)
     return PulledDataset(repo_id, commit)
-
-
-def _tag(api: HfApi, repo_id: str, commit: str) -> None:
-    """Let the format's version name the commit: without the tag lerobot refuses the dataset."""
-    with suppress(RevisionNotFoundError):  # the first push
-        api.delete_tag(repo_id, tag=CODEBASE_VERSION, repo_type=REPO_TYPE)
-    api.create_tag(repo_id, tag=CODEBASE_VERSION, revision=commit, repo_type=REPO_TYPE)
 
 
 @contextmanager

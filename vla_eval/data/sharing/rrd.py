@@ -1,13 +1,6 @@
 """Write an episode of a dataset as an `.rrd` for the rerun viewer: what a policy is trained on.
 
-    cameras/NAME                 images as they are decoded from the dataset's video
-    actions/DIM/stored, state/DIM, reward, success
-    world/arm                    where `proprio.joints` are those of the Panda
-    world/tcp, tcp_path          where the numbers of `observation.state` or `proprio.eef` begin with x, y, z
-    phase/cue|delay|response     of recordings of ours, whose manifest knows the phases
-    events, instruction          in words
-
-Any LeRobotDataset (v3) can be shown; what it does not have is left out. Timelines as in `rerun_log`.
+Any LeRobotDataset (v3) can be shown; what it does not have is left out. docs/captures.md lists the entities.
 """
 
 from collections.abc import Mapping, Sequence

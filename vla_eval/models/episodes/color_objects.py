@@ -108,7 +108,10 @@ def things_in(image: Bytes, usual: Mask) -> tuple[Thing, ...]:
     part = image[:, rows, columns]
     numbers = _numbered(unusual[rows, columns], _hues(part))
     # The part has an edge around all things, too, but where the image ends.
-    boxes = [tuple(_widened_by_one(side) for side in box) for box in ndimage.find_objects(numbers)]
+    boxes = [
+        tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in box)
+        for box in ndimage.find_objects(numbers)
+    ]
     masks = [numbers[box] == number for number, box in enumerate(boxes, start=1)]
     return tuple(
         Thing(
@@ -116,10 +119,6 @@ def things_in(image: Bytes, usual: Mask) -> tuple[Thing, ...]:
         )
         for (down, across), mask in zip(boxes, masks, strict=True)
     )
-
-
-def _widened_by_one(side: slice) -> slice:
-    return slice(max(side.start - 1, 0), side.stop + 1)
 
 
 def _later(side: slice, begin: slice) -> slice:

@@ -1,11 +1,8 @@
 """The last layers of the positive control: from what was decided, and the way to the goal, to a chunk.
 
 Where the arm goes is predicted from how far away the goal is, axis by axis, in a layer that sees nothing
-else: so it is learned once for all places, and an arm that a blind chunk has left beside the demonstrations'
-paths still finds the way. When to go is decided with all that is known.
-
-Not every task is a way to a place: to meet a rolling ball an arm has to follow it first. There a part of
-the translation may be free, predicted from all that is known.
+else; when to go is decided with all that is known. Where a task is not a way to a place, a part of the
+translation may be free (docs/positive_control.md, “Action”).
 """
 
 import math

@@ -1,9 +1,7 @@
 """Where the positive control goes: each look-up says where the place that it found lies in the world.
 
 The way from a place in an image to a place in the world is one small map per camera, the same for all
-heads, so that every episode teaches it, wherever the target lay. A layer that may use all that was looked
-up, colours included, learns 250 goals by heart instead: with nine candidates it was off by 3.4 cm in new
-episodes and by 1.7 in those that it had seen.
+heads, so that every episode teaches it (docs/positive_control.md, “Goal”).
 """
 
 from collections.abc import Sequence
@@ -50,22 +48,11 @@ class Goals(NamedTuple):
 class GoalLayer(nn.Module):
     """The mean of where the look-ups point to, weighted by how far each is believed: by camera, then of both.
 
-    What a fixed camera sees lies where it lies, wherever the arm is: its map knows nothing but the place in
-    the image. A place in the image of a camera on the arm is a ray that leaves the tool: where it meets
-    the table depends on nothing but the tool's height, linearly, and turns and moves with the tool. Maps are
-    given no more of the arm than that: one that is learns to predict the demonstration's end from the way on
-    which the arm already is (low down, it is there), and not from the image. Each map also says how sure
-    it is at a place.
-
-    In training, how far each camera is believed is learned with the rest (a mixture of experts). Squared
-    errors teach it to listen to a camera that is hardly ever far off, as the one on the arm, even where the
-    other is nearer to the truth, as at a first look from high up. So when it acts, cameras are weighed by the
-    inverse of the variance of their errors, as independent measurements are: that of a fixed camera is a
-    number, that of a ray grows with the square of its length. Both are medians over what the training met.
-
-    Args:
-        on_arm: of each camera, whether it is on the arm.
-        heads: look-ups per camera.
+    The map of a fixed camera knows nothing but the place in the image. For a camera on the arm (`on_arm`),
+    such a place is a ray that leaves the tool: where it meets the table depends on the tool's height alone,
+    linearly, and turns and moves with the tool. In training, how far each camera is believed is learned with
+    the rest. When it acts, cameras are weighed by the inverse of the variance of their errors: that of a
+    fixed camera is a number, that of a ray grows with the square of its length, both medians over training.
     """
 
     usual_error: Tensor

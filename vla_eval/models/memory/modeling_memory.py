@@ -113,10 +113,8 @@ class MikasaMemoryPolicy(EpisodePolicy):
 def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
     """Return the actions (B, chunk, action) of an answer, held from the first that is a guess.
 
-    An action is one if its error is expected to be larger by `UNFORESEEN` than that of the chunk's first
-    action. A chunk that reaches beyond the moment at which the choice is shown cannot know where to go; the
-    mean of all demonstrations would send the arm to the middle. Held: no motion (zeros, or the last action
-    that is foreseen), the gripper as it was.
+    A guess is an action whose error is expected to be larger by `UNFORESEEN` than that of the chunk's first
+    (docs/positive_control.md). Held: no motion (zeros, or the last action foreseen), the gripper as it was.
     """
     doubts = answer.doubts.sqrt()
     foreseen = (doubts <= doubts[:, :1] + UNFORESEEN).long().cumprod(dim=1)
@@ -130,10 +128,9 @@ def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
 def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor, Tensor]:
     """Return by how much the goal of an answer (B, T) misses `right_m` (B, 3), and the loss that teaches it.
 
-    Both are in units of what the mean of the batch's goals would miss, squared. In the loss each look-up
-    answers for itself, in proportion to how far it is believed (Jacobs et al. 1991, "Adaptive Mixtures of
-    Local Experts"): where only their mean has to be right, wrong ones that cancel out stay believed. And
-    each camera does: else the first to be any good is the only one that learns. `real` (B, T): what counts.
+    Both are in units of what the mean of the batch's goals would miss, squared. In the loss each look-up and
+    each camera answers for itself (Jacobs et al. 1991, "Adaptive Mixtures of Local Experts"). `real` (B, T)
+    says what counts.
     """
     of_look_ups = (answer.pointed_m - right_m[:, None, None, None]).square().mean(dim=-1)
     of_cameras = (answer.shares * of_look_ups).sum(dim=-1)

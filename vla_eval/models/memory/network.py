@@ -1,13 +1,9 @@
 """The network of the positive control: small vision encoders, a gated memory, attention over both.
 
-What stands out at a step is written into a memory; what the memory holds is looked up in the images of
-the same step; the answer gives the next actions. The twin without memory is the same network whose memory
-is reset at each step.
-
-Things are kept as they were seen, so that they can be compared with later images: the
-memory of a thing is the mean of all that was seen, each weighted by the exponential of a learned
-importance (exponential gating: Beck et al. 2024, "xLSTM"). All else is kept in a minimal gated recurrence,
-whose gate and candidate depend on the input alone (Feng et al. 2024, "Were RNNs All We Needed?", minGRU).
+docs/positive_control.md explains its parts. The memory of a thing is the mean of all that was seen, weighted
+by the exponential of a learned importance (Beck et al. 2024, "xLSTM"); all else is kept in a minimal gated
+recurrence (Feng et al. 2024, "Were RNNs All We Needed?", minGRU). The twin without memory is the same
+network whose memory is reset at each step.
 """
 
 import math

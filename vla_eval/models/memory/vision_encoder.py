@@ -77,9 +77,7 @@ class VisionEncoder(nn.Module):
 def standing_out(colors: Tensor) -> Tensor:
     """Return (N, 1, H, W): how unlike an image's other colours each colour (N, 3, H, W) is.
 
-    Half the logarithm of 1 + its squared Mahalanobis distance from the image's mean, as in the anomaly
-    detector of Reed and Yu (1990). A red cube on an orange table is about as bright and nearly as red as its
-    surroundings; in units of how colours vary there it is far away.
+    Half the logarithm of 1 + its squared Mahalanobis distance from the image's mean (Reed and Yu 1990).
     """
     apart = colors.flatten(2) - colors.flatten(2).mean(dim=2, keepdim=True)
     variance = apart @ apart.transpose(1, 2) / apart.shape[2]

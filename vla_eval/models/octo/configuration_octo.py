@@ -170,16 +170,14 @@ class MikasaOctoConfig(PortedConfig):
         return Gripper(encoding=self.gripper_encoding, decoding=self.gripper_decoding)
 
     @property
-    def action_normalization(self) -> Normalization:
-        """Mean and deviation, the gripper left alone."""
-        n_dims = int(self.action_feature.shape[0])
-        left_alone = () if self.normalize_gripper else (self.gripper.dim,)
-        return Normalization(kind="mean_std", mask=mask_all_but(n_dims, left_alone=left_alone))
-
-    @property
     def encoder_settings(self) -> dict[str, Any]:
         """What our normalising steps are made from, statistics aside; a base's own are replaced by it."""
-        return {"fields": {ACTION_KEY: self.action_normalization}, "gripper": self.gripper}
+        left_alone = () if self.normalize_gripper else (self.gripper.dim,)
+        mask = mask_all_but(int(self.action_feature.shape[0]), left_alone=left_alone)
+        return {
+            "fields": {ACTION_KEY: Normalization(kind="mean_std", mask=mask)},
+            "gripper": self.gripper,
+        }
 
     def augmentation(self, camera: str) -> Augmentation:
         """Return how training images of a camera are changed; the first one is cropped, too."""

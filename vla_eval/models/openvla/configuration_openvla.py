@@ -12,7 +12,6 @@ from vla_eval.errors import RecipeError
 from vla_eval.features import STATE_KEY
 from vla_eval.models.openvla.sizes import Head, NetworkOptions, NetworkSizes
 from vla_eval.models.shared.images import Augmentation
-from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalization, mask_all_but
 from vla_eval.models.shared.ported_config import PromptedConfig
 from vla_eval.models.shared.stages import (
@@ -89,6 +88,8 @@ class MikasaOpenVLAConfig(PromptedConfig):
             scheduler_decay_steps: AdamW, constant, divided by ten after `scheduler_decay_steps` (0: never).
     """
 
+    sizes_class = NetworkSizes
+
     head: str = "l1"
     chunk_size: int = 8
     n_action_steps: int = 8
@@ -102,7 +103,6 @@ class MikasaOpenVLAConfig(PromptedConfig):
     def __post_init__(self) -> None:
         super().__post_init__()
         self.check_choice("head", HEADS)
-        self.network_sizes()
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""
@@ -119,10 +119,6 @@ class MikasaOpenVLAConfig(PromptedConfig):
     def reads_state(self) -> bool:
         """Whether the policy has any use for `observation.state`."""
         return self.use_proprio
-
-    def network_sizes(self) -> NetworkSizes:
-        """Return the sizes of the network."""
-        return with_changes(NetworkSizes, self.sizes)
 
     def network_options(self) -> NetworkOptions:
         """Return what the network has in addition to its sizes; needs the dataset's fields."""

@@ -102,12 +102,7 @@ def _means(image: NDArray[np.int64], n_blocks: int) -> Values:
 
 
 def novelty(before: Blocks, after: Blocks) -> float:
-    """Return by how much the image changes in one place more than around it, in [0, 1].
-
-    A cue is small and comes and goes at once. An arm that moves changes more pixels by more, but along its
-    whole outline: the greatest change in a block's surroundings is subtracted. The block for which most is
-    left counts, of any size. A change is averaged over the colours.
-    """
+    """Return by how much the image changes in one place more than around it, 0 to 1 (docs/vla_memory.md)."""
     return max(_alone(np.abs(new - old).mean(axis=0)) for old, new in zip(before, after, strict=True))
 
 

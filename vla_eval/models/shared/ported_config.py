@@ -13,6 +13,7 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from vla_eval.errors import RecipeError, check_names, unknown_name
 from vla_eval.features import ACTION_KEY
 from vla_eval.models.shared.gripper import Gripper
+from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalization, mask_all_but
 from vla_eval.models.shared.precision import DTYPES
 from vla_eval.strict.bounds import require
@@ -80,6 +81,7 @@ class PromptedConfig(PortedConfig):
     """A policy whose language model reads images and a prompt: one frame in, one chunk out."""
 
     observation_delta_indices: ClassVar[None] = None  # the frame itself
+    sizes_class: ClassVar[Any]  # the policy's `NetworkSizes`
 
     # fields of the images that are read, in this order
     pictures: list[str] = field(default_factory=list)
@@ -98,6 +100,7 @@ class PromptedConfig(PortedConfig):
         super().__post_init__()
         self.check_choice("dtype", DTYPES)
         self.gripper_spec()
+        self.network_sizes()
         self.drop_n_last_frames = 0 if self.do_mask_loss_for_padding else self.chunk_size - 1
 
     def validate_features(self) -> None:
@@ -105,6 +108,10 @@ class PromptedConfig(PortedConfig):
         if not self.image_features or self.action_feature is None:
             raise RecipeError(f"'{self.type}' needs images and an action.")
         check_names("image", self.pictures, self.image_features, where=f"`policy.pictures` ({self.type})")
+
+    def network_sizes(self) -> Any:
+        """Return the sizes of the network."""
+        return with_changes(self.sizes_class, self.sizes)
 
     def gripper_spec(self) -> Gripper:
         """Return how the gripper is encoded."""

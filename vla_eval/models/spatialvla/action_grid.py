@@ -129,8 +129,7 @@ def refitted(table: Tensor, old: ActionGrid, new: ActionGrid) -> Tensor:
 
     A token's embedding is read from the old table at its new place: linearly along each of the three axes,
     between the middles of the old bins, and at the outermost middle beyond it. The gripper's two rows stay.
-    The original interpolates over a Delaunay triangulation, which on a regular grid depends on the version of
-    SciPy, and takes the first two axes for each other; both are left out here (docs/spatialvla.md).
+    What the original does is in docs/spatialvla.md.
     """
     if old.n_bins != new.n_bins:
         raise RecipeError(

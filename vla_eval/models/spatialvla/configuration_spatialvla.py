@@ -14,7 +14,6 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS
-from vla_eval.models.shared.network_sizes import with_changes
 from vla_eval.models.shared.normalization import Normalizer
 from vla_eval.models.shared.ported_config import PromptedConfig
 from vla_eval.models.shared.stages import (
@@ -109,7 +108,6 @@ class MikasaSpatialVLAConfig(PromptedConfig):
         fov_rad = self.camera_fov_rad
         require(0 < fov_rad < math.pi, "camera_fov_rad", fov_rad, "radians in (0, π)")
         require(bool(self.pictures), "pictures", [], "the fields that are read, in order")
-        self.network_sizes()
 
     def validate_features(self) -> None:
         """Check the fields of the dataset."""
@@ -121,12 +119,9 @@ class MikasaSpatialVLAConfig(PromptedConfig):
                 f"numbers, found shape {found}."
             )
 
+    sizes_class = NetworkSizes
     not_of_base = ("inference_attention",)  # a fine-tuning does not take it over
     reads_state = False
-
-    def network_sizes(self) -> NetworkSizes:
-        """Return the sizes of the network."""
-        return with_changes(NetworkSizes, self.sizes)
 
     def attention(self, *, training: bool) -> Attention:
         """Return what images and prompt attend to."""

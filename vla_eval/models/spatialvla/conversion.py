@@ -156,11 +156,8 @@ EMBEDDINGS, HEAD = "language_model.model.embed_tokens.weight", "language_model.l
 
 def to_ours(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the original's tensors under our names; an unknown name stays, and the loader refuses it."""
-    return {_renamed(name, BEGINNINGS): tensor for name, tensor in weights.items()}
-
-
-def _renamed(name: str, pairs: tuple[tuple[str, str], ...]) -> str:
-    for old, new in pairs:
-        if name.startswith(old):
-            return new + name.removeprefix(old)
-    return name
+    renamed = {}
+    for name, tensor in weights.items():
+        old, new = next((pair for pair in BEGINNINGS if name.startswith(pair[0])), ("", ""))
+        renamed[new + name.removeprefix(old)] = tensor
+    return renamed

@@ -29,7 +29,7 @@ BOUNDS = {
 class VlaMemoryConfig:
     """Memory of a VLA that reads one frame: earlier frames as further images, and recurrent tokens."""
 
-    masks_padding: ClassVar[bool]
+    masks_padding: ClassVar[bool] = False
     observation_delta_indices: ClassVar[None] = None  # the frame itself: earlier ones come as fields
 
     memory_places: int = 0  # further images of each camera at most; 0: none
@@ -129,12 +129,8 @@ class MikasaSmolVLAConfig(VlaMemoryConfig, SmolVLAConfig):  # type: ignore[misc]
 class MikasaPI0Config(VlaMemoryConfig, PI0Config):  # type: ignore[misc]  # lerobot is untyped
     """π0 with memory."""
 
-    masks_padding: ClassVar[bool] = False
-
 
 @PreTrainedConfig.register_subclass("mikasa_pi05")
 @dataclass
 class MikasaPI05Config(VlaMemoryConfig, PI05Config):  # type: ignore[misc]  # lerobot is untyped
     """π0.5 with memory."""
-
-    masks_padding: ClassVar[bool] = False

@@ -1,12 +1,11 @@
 """Recurrent memory tokens: what is carried from one pass of a language model to a later one.
 
-They stand at the end of the prefix, after images and language, in a block of attention of their own: they
-read all of the prefix, and the action expert reads them; images and language do not, so that the base's
-features stay as they were. What the last layer makes of them is written into the memory through a gate.
+They stand at the end of the prefix, in a block of attention of their own: they read all of the prefix, and
+the action expert reads them; images and language do not. What the last layer makes of them is written into
+the memory through a gate.
 
-Source: Recurrent Memory Transformer (Bulatov et al. 2022, https://arxiv.org/abs/2207.06881), section 3:
-tokens whose outputs are the next segment's inputs, trained through several segments. The gate, which lets a
-token stay as it is over a delay, is ours, in the form of a GRU's (Cho et al. 2014).
+Source: Recurrent Memory Transformer (Bulatov et al. 2022, https://arxiv.org/abs/2207.06881), section 3. The
+gate, which lets a token stay as it is over a delay, is ours, in the form of a GRU's (Cho et al. 2014).
 """
 
 from typing import Any, NamedTuple  # lerobot is untyped

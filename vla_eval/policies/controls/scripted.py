@@ -1,13 +1,8 @@
-"""Controls: policies without a model, against which a learned one is measured.
+"""Controls: policies without a model, against which a learned one is measured (docs/measuring.md, audit.md).
 
-- `random`: uniform in the action space. The floor: how often random motion succeeds, which is hardly ever.
-- `hold`: moves nothing, keeps the gripper's width.
-- `oracle`: the privileged expert: the ceiling at this chunk length.
-- `cue_blind`: the same arm, not knowing the cue: what a perfect arm without memory gets (chance).
-- `tour`: the same arm begins with a random candidate and continues with the nearest that is left, without
-  ever knowing which one is right: what can be had by searching.
-- `cue_reader`: the same arm goes to what was in view at its own inferences, and guesses what was not: the
-  ceiling of a policy that reads only the last frame, at this chunk length and first inference.
+- `random`: uniform in the action space. `hold`: moves nothing, keeps the gripper's width.
+- `oracle`, `cue_blind`, `tour`, `cue_reader`: the expert's arm, which knows the answer, guesses it, searches
+  for it, or knows of it what was in view at its own inferences.
 
 The last four see the true state of the world, but not the answer before the choice can be made, and
 plan a whole chunk open loop from what they see at one inference. Nothing here is ever rendered.

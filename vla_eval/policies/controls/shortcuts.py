@@ -1,18 +1,7 @@
-"""Controls that succeed without a memory of their own: they show which shortcuts a task leaves open.
+"""Controls that succeed without a memory of their own: `body_memory`, `cue_touch`, `one_frame`.
 
-- `body_memory`: while the cue is there, it closes the gripper to a width that stands for the right
-  candidate; afterwards it reads the width back from its proprioception, and holds it. It keeps nothing
-  from step to step: what it does at a step follows from that step's observation alone. So any policy
-  that reads the last frame could do the same, and a task that it wins does not need a memory as long as
-  arm and gripper may move before the choice (`freeze_until_choice` forbids it).
-- `cue_touch`: goes to the place where the cue is shown as soon as the episode begins, and stays there. It
-  wins where touching the cue counts (`phase_gate_success=False`), and where the arm's place keeps the
-  answer: over the ball of a shell game, where it goes down on the mug that it finds nearest.
-- `one_frame`: meets a rolling ball with the oracle's controller, but keeps nothing between inferences, and
-  sees where the ball is, not how fast it rolls. It assumes the mean speed of the task; next to the ball,
-  which it followed to get there, the speed of its own arm. So any policy that reads the last frame and its
-  joints' speeds could do the same. In TakeItBack it drags the cube back along the line from the middle of
-  the disc through the cube: where the cube is on the disc keeps the answer.
+They show which shortcuts a task leaves open; docs/audit.md says what each does. `body_memory` and `one_frame`
+keep nothing from one inference to the next: any policy that reads the last frame could do the same.
 """
 
 from dataclasses import replace

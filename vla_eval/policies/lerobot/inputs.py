@@ -16,7 +16,7 @@ from vla_eval.checkpoints.files import TrainingFacts
 from vla_eval.checkpoints.loading import LoadedPolicy
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
 from vla_eval.control_modes import CONTROL_MODE
-from vla_eval.core import FloatArray, Observation
+from vla_eval.core import Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
 from vla_eval.features import STATE_KEY, STATE_NAMES, StateKind, proprioception
 from vla_eval.specs import EnvSpec
@@ -44,13 +44,10 @@ class InputMap:
             for camera, key in self.cameras.items()
         }
         if self.state is not None:
-            fields[STATE_KEY] = torch.from_numpy(self._proprioception(observation))
+            given = observation.state.get(self.state)  # a client may have computed it
+            state = proprioception(observation.state)[self.state] if given is None else given
+            fields[STATE_KEY] = torch.from_numpy(state)
         return fields
-
-    def _proprioception(self, observation: Observation) -> FloatArray:
-        assert self.state is not None
-        given = observation.state.get(self.state)  # a client may have computed it
-        return proprioception(observation.state)[self.state] if given is None else given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

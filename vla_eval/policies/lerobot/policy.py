@@ -1,25 +1,10 @@
 """Run any LeRobot policy in our loop: frames in, whole chunks out.
 
-The policy's own queue of actions is never used: `predict_action_chunk` is asked at each inference, and
-the loop executes as much of the chunk as it wants. Its own queue of observations is not used either:
-the frames of an episode are kept here, per slot, at control rate, however long the chunk is.
-
-Three kinds of policies; the configuration decides:
-
-- `observation_delta_indices` is None, or has frames of the future, which only training has (FastWAM): it
-  reads the last frame, (B, …) (ACT, π0, π0.5, π0-FAST).
-- with indices, such as [-1, 0] or [0]: it gets these frames, (B, T, …), as in training (Diffusion
-  Policy, SmolVLA); before the first frame of an episode there is the first frame again. One whose
-  configuration says `masks_history = True` gets `FIELD_is_pad`, which marks these frames (Octo).
-- with a method `remember(batch, memory) -> memory`: it is given each frame once, in order, batch
-  (1, T, …), and its memory of the episode so far (None at its beginning); `predict_action_chunk` then
-  gets `memory` (a recurrent policy of your own). One that also has `begin_memory(n_episodes) -> memory`,
-  a tuple of tensors (B, …), infers for several episodes in one pass: see `models.episodes.memory`.
-
-Any of them may be shown earlier frames as further images: see `vla_memory/`.
-
-Types of lerobot's that collect their frames themselves (VQ-BeT, TD-MPC, multi-task DiT) are the exception:
-they are asked for one action at each control step, with queues for each episode (`checkpoints.select_step`).
+The policy's own queues of actions and observations are not used: the loop executes as much of a chunk as it
+wants, and the frames of an episode are kept here, per slot, at control rate, however long the chunk is. Which
+frames a policy gets, its configuration says (docs/lerobot_policies.md). Types that collect their frames
+themselves are asked for one action at each control step, with queues for each episode
+(`checkpoints.select_step`).
 """
 
 from collections.abc import Mapping, Sequence

@@ -17,8 +17,11 @@ CURVES: dict[str, str] = {
 
 def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
     """Write a PNG file per task and kind of curve, next to the folder of runs, and return their paths."""
-    curves = by_kind(table.retention)
-    return write_beside(folder, {f"{own[0].task}_{own[0].of}": retention_png(own) for own in curves})
+    drawn = {
+        f"{own[0].task}_{own[0].of}": curves_png(retention_lines(own, line_colors(own)))
+        for own in by_kind(table.retention)
+    }
+    return write_beside(folder, drawn)
 
 
 def by_kind(curves: Sequence[Retention]) -> list[list[Retention]]:
@@ -30,11 +33,6 @@ def by_kind(curves: Sequence[Retention]) -> list[list[Retention]]:
 def line_colors(curves: Sequence[Retention]) -> dict[str, int]:
     """Return the color of each curve by the name of its line."""
     return {name: number for number, name in enumerate(dict.fromkeys(map(line_name, curves)))}
-
-
-def retention_png(curves: Sequence[Retention]) -> bytes:
-    """Return curves of one task and kind; the same curves give the same bytes."""
-    return curves_png(retention_lines(curves, line_colors(curves)))
 
 
 def retention_lines(curves: Sequence[Retention], colors: Mapping[str, int]) -> Curves:

@@ -13,8 +13,7 @@ from vla_eval.page.rates import Plots, Sign
 from vla_eval.page.tables import Matrix, page_table, shaded
 from vla_eval.probe.choice_pairs import ChoicePairs
 from vla_eval.probe.find_worlds import Found, FoundProbe, find_probes
-from vla_eval.probe.grid_sentences import grid_notes, grid_sentences
-from vla_eval.probe.grid_text import printed_grid
+from vla_eval.probe.grid_text import grid_notes, grid_sentences, printed_grid
 from vla_eval.probe.page.heat_maps import heat_maps
 from vla_eval.probe.page.retention_plot import CURVES, by_kind, line_colors, line_name, retention_lines
 from vla_eval.probe.probe_text import printed_probe

@@ -1,10 +1,10 @@
 """What a fine-tuning takes, before it is started: parameters, memory, steps, hours, and what is assumed."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any  # lerobot is untyped
+from typing import Any, NamedTuple  # lerobot is untyped
 
 import torch
 
@@ -12,7 +12,6 @@ from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.evaluation.model_table import SUSTAINED_TFLOPS
 from vla_eval.models.weights.empty import empty_weights
-from vla_eval.training.cost.description import GIB, ModelDescription, describe_model
 from vla_eval.training.cost.sample_cost import SampleCost, sample_cost
 from vla_eval.training.lora import peft_config
 
@@ -21,6 +20,42 @@ CPU_TFLOPS = 0.1
 ASSUMED_STEPS = 50
 """After so many steps, a training compares the assumed rate with its own."""
 TERA = 1e12
+GIB = 1 << 30
+MODULE_DEPTH = 3  # of a parameter's name: deep enough to tell an action expert from a language model
+OPTIMIZER_STATES = 2  # AdamW keeps two moments per trained parameter, in the parameter's type
+
+
+class ModuleSize(NamedTuple):
+    """Parameters of one part of the model."""
+
+    name: str
+    n_trained: int
+    n_parameters: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelDescription:
+    """The parts of a model, and the memory that weights, gradients and optimizer need."""
+
+    modules: tuple[ModuleSize, ...]  # parts, largest first
+    # `n_trained`, `n_parameters`: of the whole model
+    n_trained: int
+    n_parameters: int
+    # `weights_bytes`, `training_bytes`: what weights take; what gradients and optimizer add
+    weights_bytes: int
+    training_bytes: int
+
+    def lines(self) -> Iterable[str]:
+        """Yield lines for a person, before the first step."""
+        share = self.n_trained / self.n_parameters if self.n_parameters else 0.0
+        yield f"trained: {self.n_trained:,} of {self.n_parameters:,} parameters ({share:.1%})"
+        for module in self.modules:
+            yield f"  {module.n_trained:>13,} of {module.n_parameters:>13,}  {module.name}"
+        total = self.weights_bytes + self.training_bytes
+        yield (
+            f"memory, at least: {total / GIB:.2f} GiB = weights {self.weights_bytes / GIB:.2f} + gradients "
+            f"and AdamW {self.training_bytes / GIB:.2f}; activations come on top and grow with batch_size"
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,11 +74,6 @@ class Estimate:
     def fixed_bytes(self) -> int:
         """Weights, gradients and optimizer."""
         return self.model.weights_bytes + self.model.training_bytes
-
-    @property
-    def total_bytes(self) -> float | None:
-        """With the activations of a micro batch; None if they are not known."""
-        return None if self.cost is None else self.fixed_bytes + self.micro_batch_size * self.cost.saved_bytes
 
     @property
     def step_seconds(self) -> float | None:
@@ -93,12 +123,13 @@ def with_adapters(model: Any, recipe: FinetuneRecipe) -> Any:
 def estimate_lines(found: Estimate, *, device_bytes: float | None) -> Iterator[str]:
     """Yield lines for a person, the assumptions last."""
     yield from found.model.lines()
-    cost, total, seconds = found.cost, found.total_bytes, found.step_seconds
+    cost, seconds = found.cost, found.step_seconds
     samples = found.steps * found.batch_size
     yield f"steps: {found.steps:,} of {found.batch_size} samples, {samples:,} samples"
-    if cost is None or total is None or seconds is None:
+    if cost is None or seconds is None:
         yield "no estimate of activations and hours: the tokens of this type of policy are not known here"
         return
+    total = found.fixed_bytes + found.micro_batch_size * cost.saved_bytes
     yield (
         f"memory, estimated: {total / GIB:.1f} GiB with {found.micro_batch_size} samples at once, whose "
         f"activations take {found.micro_batch_size * cost.saved_bytes / GIB:.1f} "
@@ -152,4 +183,28 @@ def rate_line(found: Estimate, measured_s: float, n_left: int) -> str:
     return (
         f"rate: {measured_s:.3f} s per step, {reached:.2g} TFLOP/s; assumed were {found.step_seconds:.3f} s "
         f"at {found.tflops:g} TFLOP/s: {measured_s / found.step_seconds:.2f} times as long; {left}"
+    )
+
+
+def describe_model(model: Any) -> ModelDescription:  # Any: a torch module of lerobot's
+    """Count the parameters of a model."""
+    trained: dict[str, int] = {}
+    total: dict[str, int] = {}
+    weights_bytes = training_bytes = 0
+    for name, parameter in model.named_parameters():
+        part = ".".join(name.split(".")[:-1][:MODULE_DEPTH]) or name
+        n, n_bytes = parameter.numel(), parameter.numel() * parameter.element_size()
+        total[part] = total.get(part, 0) + n
+        trained[part] = trained.get(part, 0) + (n if parameter.requires_grad else 0)
+        weights_bytes += n_bytes
+        training_bytes += n_bytes * (1 + OPTIMIZER_STATES) if parameter.requires_grad else 0
+    return ModelDescription(
+        modules=tuple(
+            ModuleSize(part, trained[part], n)
+            for part, n in sorted(total.items(), key=lambda item: (-item[1], item[0]))
+        ),
+        n_trained=sum(trained.values()),
+        n_parameters=sum(total.values()),
+        weights_bytes=weights_bytes,
+        training_bytes=training_bytes,
     )

@@ -11,12 +11,11 @@ from vla_eval.storage.provenance import collect_environment, vulkan_drivers
 from vla_eval.storage.run_file import JsonValue, find_changes
 from vla_eval.workers.needed_files import Needed
 from vla_eval.workers.parcel import PackedFolder, unpack
-from vla_eval.workers.start import visible_gpus
+from vla_eval.workers.start import available_ram_bytes, visible_gpus
 
 KIND_FACTS = ("cpu", "mesa", "nvidia_driver")
 """What may move the last bits of a state or a pixel while code and packages are the same."""
 KIND_DIGITS = 8  # of a digest, for people
-MEMINFO_FILE = Path("/proc/meminfo")
 LEAST_FREE_BYTES = 1 << 30  # a worker with simulator and policy has more
 GB = 1e9
 
@@ -59,7 +58,7 @@ def node_facts(needs: tuple[Needed, ...] = (), *, folder: str = ".") -> NodeFact
     return NodeFacts(
         environment=collect_environment(),
         vulkan=vulkan_drivers(),
-        free_bytes=_free_memory_bytes(),
+        free_bytes=available_ram_bytes() or os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"),
         n_gpus=len(visible_gpus()),
         missing=missing,
         absent=absent,
@@ -78,15 +77,6 @@ def receive(folders: Sequence[PackedFolder], needs: tuple[Needed, ...], *, folde
         found = node_facts(needs, folder=folder)
         return replace(found, missing=(*found.missing, f"a checkpoint cannot be written there ({exc})"))
     return node_facts(needs, folder=folder)
-
-
-def _free_memory_bytes() -> int:
-    # What Linux keeps of files counts as free.
-    for line in MEMINFO_FILE.read_text(encoding="utf-8").splitlines():
-        name, _, rest = line.partition(":")
-        if name == "MemAvailable":
-            return int(rest.split()[0]) << 10
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def objections(found: NodeFacts, expected: NodeFacts, *, allow_other_kind: bool) -> tuple[str, ...]:
