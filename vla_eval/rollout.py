@@ -1,9 +1,8 @@
 """Run one batch of episodes from start to record. Knows nothing of simulators, models or files.
 
-One control step: each episode that is due for an inference asks the policy for a chunk (the policy is given
-the frames since its last inference, or only the newest one); the chunk executor chooses the action; the
-environment executes it, and renders only if somebody will use the image. What is counted, checked and
-recorded on the way is in `episode_log.py`.
+One control step: episodes that are due for an inference ask the policy for a chunk; the chunk executor
+chooses the action; the environment executes it, and renders only if somebody will use the image. What is
+counted and recorded on the way is in `episode_log.py`.
 """
 
 from collections.abc import Callable, Sequence

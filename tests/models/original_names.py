@@ -21,7 +21,7 @@ from vla_eval.models.openvla.weight_names import (
     TOP,
     _replaced,
 )
-from vla_eval.models.spatialvla.conversion import BEGINNINGS, _renamed
+from vla_eval.models.spatialvla.conversion import BEGINNINGS
 
 
 def openvla_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
@@ -54,8 +54,11 @@ def openvla_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 def spatialvla_names(weights: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return our tensors under the original's names."""
-    back = tuple((ours, original) for original, ours in BEGINNINGS)
-    return {_renamed(name, back): tensor for name, tensor in weights.items()}
+    original = {}
+    for name, tensor in weights.items():
+        theirs, ours = next((pair for pair in BEGINNINGS if name.startswith(pair[1])), ("", ""))
+        original[theirs + name.removeprefix(ours)] = tensor
+    return original
 
 
 def _back(pairs: Iterable[tuple[str, str]]) -> tuple[tuple[str, str], ...]:

@@ -1,8 +1,7 @@
 """The functions of libraries that import code, unpickle, or open more than data: closed while files are read.
 
-Each of them is replaced once, wherever it has been imported, by one that asks whether a checkpoint is open.
-If so it refuses, for every caller and in every thread; if not it does what it always did. A refusal that a
-library swallows is raised at the end. `foreign_code` says which doors there are.
+Each is replaced once by one that asks whether a checkpoint is open. If so it refuses, in every thread; a
+refusal that a library swallows is raised at the end. `foreign_code` says which doors there are.
 """
 
 import contextlib

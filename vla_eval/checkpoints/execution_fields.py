@@ -1,8 +1,7 @@
 """Fields of LeRobot's configurations that say how chunks are executed, and how each is answered here.
 
-LeRobot's own loop (`select_action`) reads them; ours asks for whole chunks and executes them as an evaluation
-says. All other fields are honoured: LeRobot's classes are built from them, and processors come from the
-checkpoint. A test compares this table with the installed lerobot. Standard library only.
+LeRobot's own loop (`select_action`) reads them. A test compares this table with the installed lerobot.
+Standard library only.
 """
 
 from collections.abc import Mapping

@@ -1,8 +1,7 @@
 """Run no Python code that a checkpoint, or a tokenizer or backbone that it names, brings along.
 
-lerobot passes `trust_remote_code=True` with names that a checkpoint's configuration chooses, and transformers
-looks up class names from files among all that it has, unpickles weights, and hands adapters to peft. Here are
-the functions that all of these go through, and what they may still do; docs/security.md lists them.
+Here are the functions of lerobot, transformers and peft that all such code goes through, and what they may
+still do; docs/security.md lists them.
 """
 
 import contextlib

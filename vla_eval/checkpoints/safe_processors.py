@@ -1,9 +1,7 @@
 """The one door through which a saved processor comes in: names are resolved and steps are made here.
 
-lerobot imports and calls whatever a checkpoint names, and asks only then whether it is a processor's step.
-Here a name is first looked at as text, then only modules of processors of installed packages are imported,
-then the class is checked, then its settings, and only then it is called. The pipeline is made of just what
-was checked: lerobot reads none of these files again.
+lerobot imports and calls whatever a checkpoint names. Here a name is first looked at as text, then only
+modules of processors of installed packages are imported, then class and settings are checked.
 """
 
 import contextlib

@@ -1,7 +1,6 @@
 """Give a dataset with our fields the records that training asks for, after another tool has edited it.
 
-`lerobot-edit-dataset` splits, merges and deletes, and does not copy `meta/mikasa/`. What only a recording
-knows (seeds, phases, digests of states) is lost, and nothing is made up: an adopted dataset is an import.
+What only a recording knows is lost, and nothing is made up: an adopted dataset is an import.
 """
 
 from pathlib import Path

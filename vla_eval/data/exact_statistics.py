@@ -1,11 +1,8 @@
 """Statistics over all frames of a dataset, exact, in lerobot's form.
 
 lerobot 0.6.1 averages the quantiles of the episodes: of a state that is constant per episode, 0 to 9,
-it makes q01 = q99 = 4.5. Policies that normalise by quantiles would be fed nonsense. Here numbers come
-from all rows, and those of images from histograms of all raw pixels.
-
-They are facts, and a normalisation cannot divide by each of them: `usable_statistics` is the one rule for
-dimensions of state and action that hardly move, whatever a policy normalises by.
+it makes q01 = q99 = 4.5. Here numbers come from all rows, and those of images from histograms of all raw
+pixels. A normalisation cannot divide by each of them: `usable_statistics` is the one rule for that.
 """
 
 from collections.abc import Iterator, Mapping

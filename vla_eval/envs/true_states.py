@@ -1,8 +1,7 @@
 """Keep what an environment shows apart from what is, where its `evaluate` writes poses.
 
 The true poses are remembered before `evaluate`, and put back before the next physics step, unless it also
-writes a velocity: then the object is placed for good. What is parked far above the table stays there.
-docs/official_suite.md says why. Knows nothing of single tasks.
+writes a velocity: then the object is placed for good. docs/official_suite.md says why.
 """
 
 import contextlib

@@ -1,8 +1,7 @@
 """Evaluate: plan the episodes, run those that have no result yet, store each as it comes.
 
-Only this process writes results. An episode that cannot be run becomes an error record and the next
-one is run; a mistake that every episode would repeat ends the run. Stopped at any moment, by any
-means, the same call resumes where it stopped.
+Only this process writes results. An episode that cannot be run becomes an error record; a mistake that
+every episode would repeat ends the run.
 """
 
 import contextlib

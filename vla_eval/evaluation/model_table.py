@@ -1,8 +1,7 @@
 """A table of learned policies: which fine-tunings and evaluations it takes, and the folder of each.
 
-`configs/paper_vla_table.yaml` is one. A row is a policy at its own numbers of action steps; it is fine-tuned
-for each task and run seed by itself, and each such checkpoint is evaluated on the same seeds. Nothing is run
-here. Standard library only: `mikasa-vla finetune CONFIG --help` need not wait for torch.
+`docs/paper_table.md` explains them. Standard library only: `mikasa-vla finetune CONFIG --help` need not wait
+for torch.
 """
 
 from collections.abc import Collection, Iterator, Sequence

@@ -1,8 +1,7 @@
 """The inside of a worker process: keep an environment and a policy, run one batch at a time.
 
-It gets its jobs over a pipe and says in shared memory what it is busy with. It writes no file but its log
-and, if asked, videos and rerun files of its episodes. After an error it is replaced by a new process: a
-native library or a GPU context may be left in a state that nothing within the process can repair.
+After an error it is replaced by a new process: a native library or a GPU context may be left in a state that
+nothing within the process can repair.
 """
 
 import dataclasses

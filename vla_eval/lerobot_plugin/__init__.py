@@ -1,6 +1,4 @@
-"""The plug-in for LeRobot's own commands: importing this package registers it with lerobot.
-
-The environment `mikasa`, and our families of policies.
+"""The plug-in for LeRobot's own commands: importing this package registers `mikasa` and our families.
 
 Named by `--env.discover_packages_path=vla_eval.lerobot_plugin`, or found by itself where the
 distribution of the folder `plugins/` is installed.

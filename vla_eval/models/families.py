@@ -1,7 +1,6 @@
 """The families of policies, a row for each: ours and those of LeRobot's that a row is needed for.
 
-Everything else reads these rows. A new family is its folder, a row, a recipe in `policies/`, and tests; types
-that are understood from their configuration alone need no row. Standard library only.
+Types that are understood from their configuration alone need no row. Standard library only.
 """
 
 import importlib

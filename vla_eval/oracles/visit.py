@@ -1,8 +1,7 @@
 """Expert for several cubes: move low from one to the next and stop over each until it is touched.
 
-The arm stays at one height over the tops of the cubes, so moving from one to the next is one short
-motion. With one action per inference it reads from the state which cubes were touched. With more it
-predicts touches with the model of the arm, and returns to a cube that was not touched.
+With one action per inference it reads from the state which cubes were touched; with more it predicts touches
+with the model of the arm, and returns to a cube that was not touched.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,7 @@
 """Turn a matplotlib figure into SVG for use inside a page. Knows nothing of what is drawn.
 
-matplotlib writes stand-alone files: with fixed colors, a style sheet for the whole document, and ids that
-two figures of one page would share. Here colors become the page's variables, so that dark mode and printing
-work, and definitions are inlined where they are used.
+Colors become the page's variables, so that dark mode and printing work; definitions, whose ids two figures
+would share, are inlined.
 """
 
 import io

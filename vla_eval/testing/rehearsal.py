@@ -1,6 +1,4 @@
-"""Rehearse a recipe at its true size with random weights: write a checkpoint, load it strictly, act.
-
-Or a checkpoint that is there: load it, act.
+"""Rehearse a recipe at its true size with random weights, or a checkpoint: write, load it strictly, act.
 
 What is measured is memory, disk and time; the actions mean nothing. Weights are made part by part, so that
 they are in memory once, when they are loaded.

@@ -1,8 +1,7 @@
 """Evaluate checkpoints during training, on seeds that are used for nothing else.
 
-An evaluation is an ordinary one, in worker processes: it draws from none of the training's generators.
-It runs while the training waits, since both need the same device. A training that was killed during one
-finishes it first and then resumes.
+It runs while the training waits, since both need the same device, and draws from none of its generators. A
+training that was killed during one finishes it first and then resumes.
 """
 
 import functools

@@ -1,7 +1,6 @@
 """One connection to a policy server, and episodes of noise over it, for `check.py`.
 
-This file runs with Python 3.8, numpy 1.22 and websockets 13, and imports nothing else but files next to
-it: `mikasa_vla_client` ships it, too. It knows no policy and no simulator.
+This file runs with Python 3.8, numpy 1.22 and websockets 13, with files next to it: see `mikasa_vla_client`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,10 @@
 """Observations for checks: noise in which two episodes differ in whatever a policy may read of them.
 
-An episode looks one of four ways at each step: warm or cold, left or right. These two say the order of the
-colours, the brightness, the place of a bright patch, the signs of the state and which sentence is given. Of
-the seeds 0 to 3 each looks another way at the same step, and each looks all four ways in turn: so whatever
-a policy computes of them, also if only a yes or no is left of it, differs between some two.
+An episode looks one of four ways at each step: warm or cold, left or right. Of the seeds 0 to 3 each looks
+another way at the same step, and each looks all four ways in turn: so whatever a policy computes of them,
+also if only a yes or no is left of it, differs between some two.
 
-This file runs with Python 3.8 and numpy 1.22, and imports nothing else but the file next to it:
-`mikasa_vla_client` ships it, too.
+This file runs with Python 3.8 and numpy 1.22, with the file next to it: see `mikasa_vla_client`.
 """
 
 from __future__ import annotations

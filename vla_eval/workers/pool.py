@@ -4,10 +4,8 @@ Ours: `multiprocessing.Pool`, `concurrent.futures` and loky do not limit the tim
 limit it by stage, and none of them ends what a policy has started.
 
 A worker that exceeds a time limit writes its stack to its log and is killed; one that dies is replaced.
-Both give an `EpisodeError` with the cause. A process does the jobs of one setup key
-only: whatever a policy changes in its process, from the default dtype to numpy's functions, ends with
-the process. Knows nothing of environments, policies or files of results, nor of what a job is: the
-inside of a worker is `vla_eval.evaluation.worker`, or `vla_eval.data.recording.worker`.
+Both give an `EpisodeError` with the cause. A process does the jobs of one setup key only: whatever a policy
+changes in its process ends with it.
 """
 
 import signal

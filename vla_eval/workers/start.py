@@ -1,7 +1,6 @@
 """Start worker processes: forked from one server that has done the slow imports.
 
-Importing torch, ManiSkill and lerobot takes seconds and hundreds of megabytes, for every worker and again
-after every error; a fork has them at once, and shares the memory. Where there is an NVIDIA driver each
+A fork has torch, ManiSkill and lerobot at once, and shares their memory. Where there is an NVIDIA driver each
 worker starts from nothing: a CUDA context does not survive a fork, and an import may open one.
 """
 

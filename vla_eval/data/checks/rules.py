@@ -1,7 +1,6 @@
-"""The rules for demonstrations: one row each, with the answer to what breaks it.
+"""The rules for demonstrations, one row each; docs/datasets.md has the same table (tested).
 
-`refused` stops what was asked for; `kept` is said, and nothing is changed. What was *converted* because the
-user asked for it is in `foreign/changes.py`. docs/datasets.md has the same table (tested).
+`refused` stops what was asked for; `kept` is said, and nothing is changed.
 """
 
 import hashlib

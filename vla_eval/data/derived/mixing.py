@@ -1,8 +1,6 @@
 """Put complete datasets of several tasks together as one LeRobotDataset, for a policy that learns them all.
 
-lerobot's `aggregate_datasets` does it: tables and videos stay files of their own, videos byte for byte;
-episodes, frames and sentences are numbered again. Everything is checked before anything is written, and the
-new dataset appears whole or not at all. The sources stay as they are.
+lerobot's `aggregate_datasets` does it: videos byte for byte; episodes and frames are numbered again.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """Put the parts of a recording together as the datasets that one recording would have made.
 
-Each part has tried all seeds, since which ones are kept depends on all, and has rendered its share of the
-shards. The shards of all parts are those of one recording, and so the datasets are the same files.
-Everything is checked before anything is written; the parts stay as they are.
+Each part has tried all seeds, since which ones are kept depends on all, and has rendered its share of shards.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,7 @@
 """Record demonstrations: choose seeds without rendering, render and encode what is kept, put it together.
 
-One LeRobotDataset per task, OUT/TASK, since policies are trained per task. It may be stopped at any
-moment, by any means: the same call resumes where it stopped. The result depends neither on that, nor on the
-number of workers.
+One LeRobotDataset per task, OUT/TASK. Stopped at any moment, the same call resumes; the result does not
+depend on that, nor on the number of workers.
 """
 
 import functools

@@ -1,8 +1,4 @@
-"""The inside of a worker that records: tries seeds, renders and encodes shards, puts datasets together.
-
-It gets its jobs over a pipe, as `vla_eval.evaluation.worker` does, and keeps the environment between
-jobs of one kind. Only whole shards and whole datasets appear on the disk.
-"""
+"""The inside of a worker that records: tries seeds, renders and encodes shards, puts datasets together."""
 
 import dataclasses
 import errno

@@ -1,8 +1,6 @@
 """Replay the stored actions of a dataset in the simulator: the contract between data and environment.
 
-If gripper sign, range of actions, controller or a task's rules were not what they were when the dataset
-was recorded, its actions would no longer lead to its states and to success. The result is written into
-the dataset, so that training can refuse one that fails.
+The result is written into the dataset, so that training can refuse one whose actions no longer succeed.
 """
 
 from collections.abc import Hashable, Mapping, Sequence

@@ -1,8 +1,6 @@
 """Push a complete dataset to the Hugging Face Hub, and pull one, by huggingface_hub's own means.
 
-What travels can be checked: a recording, an import or a mixture that is complete and undamaged, in one
-commit, with the tag by which lerobot finds its format's version. Not `LeRobotDataset.push_to_hub`, which
-replaces the card by a template and leaves stale files behind.
+Not by `LeRobotDataset.push_to_hub`, which replaces the card by a template and leaves stale files behind.
 """
 
 import shutil

@@ -1,8 +1,6 @@
 """Whether demonstrations begin as episodes of an evaluation do: then a policy is tested on what it was shown.
 
-The initial states of the evaluation's seeds are made here by resetting the task, and compared with how the
-episodes of a dataset begin. Seeds alone would not do: another program's seed 1 is another episode than ours,
-and two of its seeds may be one episode.
+Initial states are compared, not seeds: another program's seed 1 is another episode than ours.
 """
 
 from collections.abc import Sequence

@@ -1,8 +1,6 @@
 """Things that appear in demonstrations: found by their colours, given each other's colours, or erased.
 
-A thing is a connected piece of an image whose pixels have one hue, and colours that the image just before the
-episode's first decision does not have, when there is nothing to choose from yet. What is done here, and why,
-is measured in docs/learning_the_rule.md. For tasks in which a colour tells what is right.
+docs/general_memory.md, “Training”, says what a thing is, and docs/learning_the_rule.md why this is done.
 """
 
 import hashlib

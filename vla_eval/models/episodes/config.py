@@ -36,13 +36,12 @@ class EpisodeConfig(PortedConfig):
     further. So any loop that follows `*_delta_indices` trains it.
 
     Nothing is normalised by statistics: positions in metres and actions in [-1, 1] need none, and rotation
-    and gripper hardly vary in scripted demonstrations, where a deviation would scale up noise.
+    and gripper hardly vary in scripted demonstrations. `docs/general_memory.md` explains the training.
     """
 
     # `mikasa-vla finetune` lets every sample be a whole episode; its parts are in it
     whole_episodes: ClassVar[bool] = True
-    # `mikasa-vla finetune` hands over images as bytes, so that numbers are made only of the frames that
-    # are used
+    # it hands over images as bytes, so that numbers are made only of the frames that are used
     takes_bytes: ClassVar[bool] = True
     # actions beyond an episode's end count nothing, see `episode_samples`
     masks_padding: ClassVar[bool] = True
@@ -54,50 +53,37 @@ class EpisodeConfig(PortedConfig):
 
     # share of a chunk's first action in the loss; the others share the rest
     first_action_weight: float = 0.5
-    # a step counts 1 + so much per unit by which its action differs from the one before, which raises
-    # the moment of decision
+    # a step counts 1 + so much per unit by which its action differs from the one before
     change_weight: float = 3.0
     # a step whose action is that of the step before is used with this probability
     waiting_share: float = 0.3
-    # share of the episodes of a training batch that end at a decision: a step at which the arm begins to
-    # move after it waited, one of the episode's at random. What happens then has to be known from
-    # memory; a step later the demonstration's own motion gives it away.
+    # share of the episodes of a training batch that end at a decision, one of the episode's at random: a
+    # step at which the arm begins to move after it waited
     decision_share: float = 0.0
-    # actions of a frame's chunk from the next decision on do not count: what they depend on has not been
-    # seen yet. Otherwise the mean of all motions is learned for them, and a chunk that is executed
-    # across the decision takes the arm to where no demonstration has it. The goal does not count before
-    # the first decision either: it could only be learned by heart there.
+    # actions of a frame's chunk from the next decision on do not count, nor does the goal before the
+    # first decision: what they depend on has not been seen yet
     masks_beyond_decision: bool = False
-    # with `masks_beyond_decision`, those actions are not left out, but replaced by the one before the
-    # decision: to continue waiting. A chunk executed across the decision then keeps the arm where it is
-    # until the policy is asked again.
+    # with `masks_beyond_decision`, those actions are replaced by the one before the decision: to wait
     waits_beyond_decision: bool = False
-    # the frame of a decision is shown up to so many times again in training, at random: a policy that is
-    # not asked at every step sees it several times before it may decide. All of them together count as
-    # much as one.
+    # the frame of a decision is shown up to so many times again in training, at random; all of them
+    # together count as much as one
     late_steps: int = 0
     # of the auxiliary loss, in units of its variance: where the demonstration ends
     goal_weight: float = 1.0
-    # the three colours of an episode's images change places at random in training
-    mix_colors: bool = False
-    # share of the episodes in which the things that appear exchange their colours, alike in all frames:
-    # a scene looks otherwise each time. See `things`.
+    mix_colors: bool = False  # the colours of an episode's images change places at random in training
+    # share of the episodes in which the things that appear exchange their colours, alike in all frames,
+    # see `things`
     exchange_share: float = 0.0
     # of those that end at their first decision, the share in which some of the things that appear at it,
-    # but of no colour that was shown before, are erased: a rule is learned sooner where there is less to
-    # choose from
+    # but of no colour that was shown before, are erased
     erase_share: float = 0.0
     # in so many training samples of a process, the number of wrong things that may stay where some are
-    # erased grows from one to all, as the square of the samples so far. 0: all may stay from the
-    # beginning.
+    # erased grows from one to all, as the square of the samples so far. 0: all may stay at once.
     erase_warmup_episodes: int = 0
-    # the images of an episode are moved by up to so many pixels in each direction in training, those of
-    # each camera by an amount of their own, the same in all frames (random shifts, Kostrikov et al.
-    # 2020, "Image Augmentation Is All You Need"). 0: they are not.
+    # the images of an episode are moved by up to so many pixels in each direction in training, see
+    # `docs/general_memory.md`
     shift_px: int = 0
-    # what is read of the instruction, a name of `SENTENCES`. A policy of one task needs nothing; one of
-    # several has to know which is meant, where the images do not show it.
-    sentence: str = "none"
+    sentence: str = "none"  # what is read of the instruction, a name of `SENTENCES`
 
     optimizer_lr: float = 2e-3
     optimizer_weight_decay: float = 1e-4

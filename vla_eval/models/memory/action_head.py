@@ -1,8 +1,6 @@
 """The last layers of the positive control: from what was decided, and the way to the goal, to a chunk.
 
-Where the arm goes is predicted from how far away the goal is, axis by axis, in a layer that sees nothing
-else; when to go is decided with all that is known. Where a task is not a way to a place, a part of the
-translation may be free (docs/positive_control.md, “Action”).
+docs/positive_control.md, “Action”, says why where the arm goes and when are layers of their own.
 """
 
 import math

@@ -1,7 +1,6 @@
 """Where the positive control goes: each look-up says where the place that it found lies in the world.
 
-The way from a place in an image to a place in the world is one small map per camera, the same for all
-heads, so that every episode teaches it (docs/positive_control.md, “Goal”).
+See docs/positive_control.md, “Goal”.
 """
 
 from collections.abc import Sequence

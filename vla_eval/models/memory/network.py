@@ -1,9 +1,7 @@
 """The network of the positive control: small vision encoders, a gated memory, attention over both.
 
-docs/positive_control.md explains its parts. The memory of a thing is the mean of all that was seen, weighted
-by the exponential of a learned importance (Beck et al. 2024, "xLSTM"); all else is kept in a minimal gated
-recurrence (Feng et al. 2024, "Were RNNs All We Needed?", minGRU). The twin without memory is the same
-network whose memory is reset at each step.
+docs/positive_control.md explains its parts. Memories: the exponential gate of Beck et al. 2024, "xLSTM", and
+the minimal gated recurrence of Feng et al. 2024, "Were RNNs All We Needed?", minGRU.
 """
 
 import math

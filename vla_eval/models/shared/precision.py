@@ -1,10 +1,7 @@
 """Which numbers are computed in which precision. Knows only torch.
 
-Big modules are made in another precision from the beginning: in float32 they would not fit into memory.
-
-Under autocast (training with `dtype: bfloat16`, any use with `use_amp`) all that a policy computes is in
-bfloat16, its images included, though its network alone is meant. So what prepares or reads out numbers
-(images, geometry, normalisation, heads) is marked `in_float32`: it is the same in training as in inference.
+Under autocast all that a policy computes is in bfloat16, its images included, though its network alone is
+meant. So what prepares or reads out numbers (images, geometry, normalisation, heads) is marked `in_float32`.
 """
 
 import contextlib

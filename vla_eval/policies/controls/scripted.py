@@ -1,11 +1,7 @@
 """Controls: policies without a model, against which a learned one is measured (docs/measuring.md, audit.md).
 
-- `random`: uniform in the action space. `hold`: moves nothing, keeps the gripper's width.
-- `oracle`, `cue_blind`, `tour`, `cue_reader`: the expert's arm, which knows the answer, guesses it, searches
-  for it, or knows of it what was in view at its own inferences.
-
-The last four see the true state of the world, but not the answer before the choice can be made, and
-plan a whole chunk open loop from what they see at one inference. Nothing here is ever rendered.
+Those of an expert's arm see the true state of the world, but not the answer before the choice can be made,
+and plan a whole chunk open loop from what they see at one inference.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,10 +1,7 @@
-"""Run any LeRobot policy in our loop: frames in, whole chunks out.
+"""Run any LeRobot policy in our loop: frames in, whole chunks out; see docs/lerobot_policies.md.
 
-The policy's own queues of actions and observations are not used: the loop executes as much of a chunk as it
-wants, and the frames of an episode are kept here, per slot, at control rate, however long the chunk is. Which
-frames a policy gets, its configuration says (docs/lerobot_policies.md). Types that collect their frames
-themselves are asked for one action at each control step, with queues for each episode
-(`checkpoints.select_step`).
+The policy's own queues are not used, and the frames of an episode are kept here, per slot, at control rate.
+Types that collect their frames themselves are asked for one action per step (`checkpoints.select_step`).
 """
 
 from collections.abc import Mapping, Sequence

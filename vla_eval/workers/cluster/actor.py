@@ -1,8 +1,6 @@
 """The inside of a cluster's actor: one worker process with its watchdog, or one policy server.
 
-An actor has a pool of one process: its time limits, its guard and its messages are those of the process pool
-of one machine, and the process has the same environment. If the actor is killed, the guard ends the process
-and all that it has started.
+An actor has a pool of one process, with the limits, guard and messages of the pool of one machine.
 """
 
 import os
