@@ -19,11 +19,7 @@ CURSOR_UP = re.compile(r"\n*(\x1b\[A)+")  # how tqdm goes back to a bar that is 
 
 
 def printable(text: str, *, keep: str = "") -> str:
-    """Return the text with an escape for each character, but those of `keep`, that is not printed as itself.
-
-    These are the control characters (C0, DEL, C1), line separators, signs that change the direction of
-    writing or are invisible, halves of characters, and what Unicode has not assigned.
-    """
+    """Return the text with an escape for each letter, but those of `keep`, that does not print as itself."""
     rest = text
     for letter in keep:
         rest = rest.replace(letter, "")

@@ -15,11 +15,9 @@ ALPHA = 0.001
 def verdict(counts: Mapping[str, Counts], chance: float | None, *, scripted: bool = True) -> tuple[str, ...]:
     """Return the verdict: the shortcuts found, or that the oracle's knowledge of the cue decides.
 
-    A control has found a shortcut if it beats chance (one-sided exact binomial test at `ALPHA`) or, if
-    chance has to be measured, the blind arm (one-sided Fisher test at `ALPHA`). Doing nothing is a shortcut
-    if it ever succeeds. Without a shortcut, a task `needs memory` if the oracle beats every other control
-    (Fisher) and, where that is known, chance; otherwise there were too few episodes. Without a scripted arm,
-    nothing but standing still is tried.
+    Tests are exact binomial (against a known chance) or Fisher (against the blind arm), one-sided at `ALPHA`.
+    Doing nothing is a shortcut if it ever succeeds. Without a shortcut, a task `needs memory` if the oracle
+    beats every other control and, where that is known, chance; otherwise there were too few episodes.
     """
     blind = counts.get("cue_blind")
     found = [

@@ -62,9 +62,6 @@ def fetch_base(
     """Make the folder `out` of a base checkpoint; one that is there is only checked.
 
     `revision`: branch, tag or commit of the repository with the weights; None: the pinned one.
-
-    Raises:
-        CheckpointError: the Hub refuses or is not there, the disk is too small, or a file is damaged.
     """
     if out.exists():
         say(f"{out} is there: {_check(base, out)}")

@@ -84,8 +84,7 @@ class ImportFacts:
         source_layout: see `foreign.episodes.Layout`; or `adopted`, if the files are those of the source.
         instruction_source: where the instruction comes from: `source`, or the prompt set of the task.
         executable_by_pd_ee_delta_pose: whether this project's environments can execute the actions.
-        absent: fields of our own datasets that the source does not have.
-        left_out: arrays of the source that were not taken over.
+        absent, left_out: fields of our own datasets that the source lacks; arrays that were not taken over.
         is_checked: False for what an older version wrote.
         converted: what was changed because it was asked for, a sentence each.
     """

@@ -69,10 +69,6 @@ def with_servers(
     """Give a phase as workers get it; of a shared policy, while its servers are there.
 
     `stops` is asked while servers start; true: give up, and give None.
-
-    Raises:
-        VlaEvalError: a server cannot be started.
-        RunChangedError: the policy is not what it was when the run was planned.
     """
     if phase.policy is None:
         yield ReadyPhase(jobs=phase.jobs, servers=None)

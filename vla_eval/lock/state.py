@@ -32,8 +32,7 @@ class State:
     Attributes:
         is_on: whether anything is refused at all.
         has_hook: whether the audit hook is installed; it cannot be removed.
-        network: why all connections are let through; None: they are not.
-        everything: why all is let through; None: it is not.
+        network, everything: why all connections, or all, are let through; None: they are not.
         code: folders that Python files may be run from.
         foreign: folders of checkpoints and datasets, which may lie within those of `code`.
         writes: files and folders that may be written.

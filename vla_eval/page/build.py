@@ -44,12 +44,7 @@ def build_page(
 ) -> str:
     """Return the page of one or more runs; the same runs give the same bytes.
 
-    Timings and videos are read from the run folders. Links to captures are relative to `folder`, where the
-    page will be; None: the current folder.
-
-    Raises:
-        ReportError: there is no episode yet.
-        UnknownNameError: there is no such baseline or protocol.
+    Links to captures are relative to `folder`, where the page will be; None: the current folder.
     """
     published = options.get("published")
     material = gather(runs, baseline=options.get("baseline"), protocols=options.get("protocols", ()))

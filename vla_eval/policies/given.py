@@ -62,9 +62,8 @@ def make_given(context: PolicyContext, *, given: GivenPolicy) -> Policy:
 
 
 def given_entry(found: object, *, name: str | None = None) -> PolicyEntry:
-    """Return an object as an entry of an evaluation.
+    """Return an object (or a class or function that makes one, from a context or nothing) as an entry.
 
-    `found` is an instance, or a class or function that makes one, from a `PolicyContext` or from nothing.
     Without a name it is called as its class or function, an instance as its `spec` says.
     """
     name = name or _name_of(found)
@@ -94,8 +93,7 @@ def given_entry(found: object, *, name: str | None = None) -> PolicyEntry:
 def identity_of(found: object) -> str:
     """Return the sha256 of what an object consists of: its code, its values, and the files of its modules.
 
-    The same cell gives the same digest again, in another kernel, too. A digest that differs without need
-    only starts a new run folder.
+    A digest that differs without need only starts a new run folder.
     """
     buffer = io.BytesIO()
     _Describer(buffer).dump(found)

@@ -32,10 +32,9 @@ def render(
 ) -> str:
     """Write the table; the text has no newline at its end.
 
-    `markdown`, `latex` and `html-table` are for reading: with these columns, in this order, or those that
-    fit `width` (None: `FITS_CHARACTERS`); `wide`: all of them, and a row per run. `csv` and `json` have every
-    column in full precision. The paper's results, or those of a published board, are marked and separate from
-    the measured ones. The preset `paper` is LaTeX with tasks as columns and policies as rows.
+    `markdown`, `latex` and `html-table` are for reading: with these columns, or those that fit `width` (None:
+    `FITS_CHARACTERS`); `wide`: all of them, and a row per run. `csv` and `json` have every column in full
+    precision. The preset `paper` is LaTeX with tasks as columns and policies as rows.
     """
     check_format(fmt, columns=columns, wide=wide, preset=preset, beside=paper or published is not None)
     sides = side_tables(table, paper=paper, published=published)

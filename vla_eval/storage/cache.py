@@ -21,8 +21,7 @@ def cache_dir() -> Path:
 def cached(name: str) -> Path:
     """Return where something of this relative path is in the cache, or where it may be made.
 
-    Where the cache cannot be written, as with a home that is read-only on the nodes of a cluster, that is a
-    temporary folder of this process.
+    Where the cache cannot be written, that is a temporary folder of this process.
     """
     wanted = cache_dir() / name
     if wanted.exists() or (reason := _why_not(wanted.parent)) is None:

@@ -39,7 +39,7 @@ def continued(
     allow_environment_change: bool,
     may_grow: bool = False,
 ) -> RunFile:
-    """Return what `run.json` must hold from now on; nothing is written.
+    """Return what `run.json` must hold from now on; nothing is written. Raises `RunChangedError`.
 
     Args:
         folder: that of `run.json`, if there is one.
@@ -47,9 +47,6 @@ def continued(
         shown: the folder that messages name.
         allow_environment_change: continue although commit or versions have changed.
         may_grow: more of what is planned, the rest being the same, is not a change.
-
-    Raises:
-        RunChangedError: configuration, recipes or environment are not what they were.
     """
     session = Session(
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),

@@ -30,10 +30,7 @@ def sync_folder(folder: Path) -> None:
 def replace_file(path: Path, text: str) -> None:
     """Write a file so that at any moment either the old content or the new one is there, never a part.
 
-    `<name>.tmp` is used on the way.
-
-    Raises:
-        StorageFullError: it could not be written; the old content is still there.
+    `<name>.tmp` is used on the way. `StorageFullError`: the old content is still there.
     """
     temporary = path.with_name(f"{path.name}.tmp")
     data = text.encode("utf-8", errors="backslashreplace")
@@ -98,12 +95,7 @@ class LineFile:
         self._fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
 
     def append(self, line: str) -> None:
-        """Append one line, given without its end.
-
-        Raises:
-            StorageFullError: the line could not be written; the file is as it was before.
-            RunFolderError: an earlier failure left the file in a state that must be repaired first.
-        """
+        """Append one line, given without its end; `StorageFullError`: the file is as it was before."""
         self.append_all([line])
 
     def append_all(self, lines: Sequence[str]) -> None:
@@ -151,10 +143,6 @@ class FolderLock:
 
     The lock belongs to the open file, so the kernel drops it when the process dies, however it dies;
     the file itself stays, with the process id in it, and means nothing.
-
-    Raises:
-        FolderInUseError: another process has it.
-        RunFolderError: the file system knows no locks.
     """
 
     def __init__(self, path: Path) -> None:

@@ -23,11 +23,7 @@ READ = "read"
 
 
 def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
-    """Return plain data of YAML or JSON as an object of a frozen dataclass; messages name the file, `where`.
-
-    Raises:
-        RecipeError: unknown or missing field, wrong type, or a value that the dataclass refuses.
-    """
+    """Return plain data of YAML or JSON as an object of a frozen dataclass; messages name `where`."""
     try:
         decoded: T = _decoded(cls, data, path="")
     except RecipeError as exc:

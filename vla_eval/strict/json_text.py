@@ -93,12 +93,7 @@ def as_dataclass[T](cls: type[T], data: Any, source: Source) -> T:  # Any: JSON
 
 
 def read_file(path: Path, source: Source) -> bytes:
-    """Return the content of a file; nothing else is opened, such as a pipe, which would never end.
-
-    Raises:
-        FileNotFoundError: there is nothing of this name.
-        VlaEvalError: of `source.error`: it is not a file, or cannot be read.
-    """
+    """Return the content of a file; nothing else is opened, such as a pipe, which would never end."""
     try:
         if path.is_symlink() and not path.exists():
             raise OSError("a link to nothing, or to itself")

@@ -28,9 +28,8 @@ def add_gradient(
 ) -> Loss:
     """Add the gradient of a batch's loss to the parameters'; `autocast`: the precision of the forward pass.
 
-    In parts of `size` samples, it is that of the whole batch wherever the policy's loss is a mean over
-    samples that count alike (ACT's is one over actions that are not padding, so not quite), except for noise
-    that the policy draws: it is drawn part by part.
+    In parts of `size` samples, it is that of the whole batch wherever the loss is a mean over samples that
+    count alike (ACT's is not quite), except for noise, which the policy draws part by part.
     """
     whole, reported = torch.zeros(()), dict[str, Any]()
     parts = [(1.0, batch)] if size is None else list(_parts(batch, size))

@@ -52,9 +52,8 @@ def open_folder(
 ) -> Path | None:
     """Make the folder of a run, or check that the one there is of the same run; return where it resumes.
 
-    `settings` are what results depend on, and must be what they were; `record` are further facts.
-    `check_steps` is called if only the number of steps differs, with that number and the steps done.
-    Files of `ignore` may lie in an empty folder.
+    `settings` are what results depend on; `record` are further facts. `check_steps` is called if only the
+    number of steps differs, with it and the steps done. Files of `ignore` may lie in an empty folder.
     """
     path.mkdir(parents=True, exist_ok=True)
     names = set(os.listdir(path))

@@ -29,15 +29,7 @@ HTTP_UNAUTHORIZED = (401, 403)
 
 
 class Connection:
-    """A connection to one server; used by one thread.
-
-    Args:
-        connect_seconds: how long to try again while nobody listens there.
-        text_markers: see `codec.packb`.
-
-    Raises:
-        RemoteConnectionError: there is no server, or it refuses.
-    """
+    """A connection to one server; used by one thread. For `text_markers`, see `codec.packb`."""
 
     def __init__(
         self,
@@ -66,13 +58,7 @@ class Connection:
             raise self._lost(exc) from exc
 
     def receive(self, *, accept_text: Collection[str] = ()) -> Any:
-        """Return the next message, or a frame of text that is in `accept_text`.
-
-        Raises:
-            RemoteTimeoutError: none came in time.
-            RemoteConnectionError: the connection is lost, or was closed after an earlier error.
-            RemoteReplyError: it is an error of the server's, or not a message.
-        """
+        """Return the next message, or a frame of text that is in `accept_text`."""
         try:
             frame = self._socket.recv(timeout=self._timeout_seconds)
         except TimeoutError as exc:

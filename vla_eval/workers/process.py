@@ -69,10 +69,7 @@ class Busy:
 class WorkerProcess:
     """One process; it starts with its first job.
 
-    Args:
-        index: which of the pool's workers it is, for messages.
-        log: where its standard output and error go.
-        predecessor: a process that is to end before this one starts: two policies are never loaded at once.
+    `predecessor` is to end before it starts: two policies are never loaded at once.
 
     Attributes:
         connection: our end of the pipe.

@@ -94,11 +94,10 @@ class RecordedActions:
 
 
 class NoisyEnv:
-    """A `SimEnv` whose arm is pushed: noise is added to the action before it is executed.
+    """A `SimEnv` whose arm is pushed: noise is added to the action, but not to the gripper's.
 
-    The expert sees where it has got to and corrects it: its answer is what a policy learns to recover by. The
-    gripper gets no noise, since no expert corrects its width. The standard deviation of each dimension is in
-    units of a delta action; in a mode that is given m and rad, a tenth of it.
+    The standard deviation of each dimension is in units of a delta action; in a mode that is given m and rad,
+    a tenth of it.
     """
 
     def __init__(self, env: SimEnv, std: float) -> None:

@@ -128,9 +128,8 @@ def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
 def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor, Tensor]:
     """Return by how much the goal of an answer (B, T) misses `right_m` (B, 3), and the loss that teaches it.
 
-    Both are in units of what the mean of the batch's goals would miss, squared. In the loss each look-up and
-    each camera answers for itself (Jacobs et al. 1991, "Adaptive Mixtures of Local Experts"). `real` (B, T)
-    says what counts.
+    In units of what the mean of the batch's goals would miss, squared. In the loss each look-up and each
+    camera answers for itself (Jacobs et al. 1991, "Adaptive Mixtures of Local Experts"). `real`: what counts.
     """
     of_look_ups = (answer.pointed_m - right_m[:, None, None, None]).square().mean(dim=-1)
     of_cameras = (answer.shares * of_look_ups).sum(dim=-1)

@@ -29,18 +29,14 @@ def put_weights(
     """Load the tensors into the policy, or raise and say which do not fit.
 
     Args:
-        policy: a torch module; the values it has are overwritten. Parameters without memory
-            (`empty_weights`) get it.
+        policy: a torch module; the values it has are overwritten.
         weights: its tensors by name; a tensor that the model has under several names may be there once.
         where: the file, for messages.
         cast: whether floating point types may differ, because the user chose another precision.
         may_be_new: beginnings of names; all tensors of one of them may be missing together and then stay
-            as the constructor made them: a head that is new in fine-tuning. Those without memory become
-            NaN: an adapter that brings them is loaded next.
-        device: where parameters without memory get it.
-
-    Raises:
-        CheckpointError: keys are missing or unexpected, or shapes or types differ.
+            as the constructor made them. Those without memory become NaN: an adapter that brings them is
+            loaded next.
+        device: where parameters without memory (`empty_weights`) get it.
     """
     sources = check_fit(policy, weights, where=where, cast=cast, may_be_new=may_be_new)
     wanted: dict[str, Tensor] = dict(policy.state_dict(keep_vars=True))

@@ -28,8 +28,7 @@ def cuda_devices(device: str) -> list[torch.device]:
 def amp_dtype(device: str) -> torch.dtype:
     """Return the half precision of `use_amp`: bfloat16, or float16 on a GPU that does not know it.
 
-    torch's own choice on any GPU is float16, whose small gradients become 0 and whose large ones overflow; a
-    policy would be trained in another precision than on a CPU.
+    torch's own choice on any GPU is float16, whose small gradients become 0 and whose large ones overflow.
     """
     kind = torch.device(device).type
     if kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False):

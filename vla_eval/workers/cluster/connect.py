@@ -38,12 +38,7 @@ def check_address(text: str) -> str:
 
 @contextlib.contextmanager
 def connected(address: str) -> Iterator[Any]:
-    """Give the module `ray`, connected to the address from `check_address`; disconnect in the end.
-
-    Raises:
-        MissingDependencyError: Ray, or the part of it that `ray://` needs, is not installed.
-        ClusterError: there is no cluster at the address.
-    """
+    """Give the module `ray`, connected to the address from `check_address`; disconnect in the end."""
     if address == "local":
         os.environ.update({name: os.environ.get(name, value) for name, value in LOCAL_VARIABLES.items()})
     ray = load_ray()
