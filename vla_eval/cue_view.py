@@ -1,7 +1,4 @@
-"""What a policy is given to see of the cue, where that is not what was rendered.
-
-The world is the same: only the images in the policy's observations change. Knows nothing of simulators.
-"""
+"""What a policy is given to see of the cue: the world is the same, its observations' images differ."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,4 @@
-"""What the loop keeps of a running episode: checks, counts, the digest, and in the end the record.
-
-Knows nothing of when a policy is asked or a simulator stepped: that is `rollout.py`.
-"""
+"""What the loop (`rollout`) keeps of a running episode: checks, counts, the digest, in the end the record."""
 
 import hashlib
 from collections.abc import Sequence

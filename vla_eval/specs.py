@@ -1,7 +1,4 @@
-"""What an environment provides and a policy needs, as data that can be compared before the first step.
-
-Knows nothing of simulators or models.
-"""
+"""What an environment provides and a policy needs, as data that can be compared before the first step."""
 
 from dataclasses import dataclass
 from typing import Literal

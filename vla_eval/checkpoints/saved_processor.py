@@ -1,7 +1,4 @@
-"""The description of a processor as a checkpoint has it: steps, settings, files. Read without torch.
-
-Names are resolved, and steps made, by `safe_processors`.
-"""
+"""The description of a processor as a checkpoint has it, read without torch; `safe_processors` makes it."""
 
 import os
 import shlex

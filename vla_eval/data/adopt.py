@@ -1,7 +1,4 @@
-"""Give a dataset with our fields the records that training asks for, after another tool has edited it.
-
-What only a recording knows is lost, and nothing is made up: an adopted dataset is an import.
-"""
+"""Give a dataset with our fields, which another tool has edited, the records that training asks for."""
 
 from pathlib import Path
 from typing import Any  # lerobot is untyped

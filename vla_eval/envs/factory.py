@@ -1,7 +1,4 @@
-"""Make an environment from its settings. The only module that knows which simulators exist.
-
-Each simulator is imported on first use, so no command imports one that it does not use.
-"""
+"""Make an environment from its settings: alone knows which simulators exist, imports them on first use."""
 
 import importlib
 from collections.abc import Callable, Mapping

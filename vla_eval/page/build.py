@@ -1,8 +1,4 @@
-"""Build the report page: one self-contained HTML file. It computes no number.
-
-The markup is in `templates/`. Whatever a template is given is escaped, unless it is `Markup`: the drawings of
-`svg.py` and the JSON report.
-"""
+"""Build the report page: one HTML file. It computes no number, and escapes what is not `Markup`."""
 
 import base64
 import hashlib

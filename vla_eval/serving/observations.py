@@ -1,7 +1,4 @@
-"""From a request to an observation: cameras, proprioception, instruction; what does not fit is refused.
-
-Nothing is resized, converted or filled in here: that is the client's, which knows its own cameras.
-"""
+"""From a request to an observation; what does not fit is refused, and nothing is resized or filled in."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Read `episodes.jsonl`, and repair its end after its writer was killed.
-
-One line is one `EpisodeRecord`. What follows the last newline is not a line yet.
-"""
+"""Read `episodes.jsonl`, one record per line, and repair its end after its writer was killed."""
 
 import json
 import logging

@@ -1,7 +1,4 @@
-"""`run.json`: what a run was started with, each time it was started, and whether that has changed.
-
-Knows nothing of episodes; the values it keeps are plain JSON and mean nothing to it.
-"""
+"""`run.json`: what a run was started with, each time it was started, and whether that has changed."""
 
 import json
 from collections.abc import Collection, Iterator, Mapping, Sequence

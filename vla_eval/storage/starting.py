@@ -1,7 +1,4 @@
-"""Start to write into a folder: make it, lock it, and remove it again if the start fails.
-
-A mistake leaves no empty folder behind. Knows nothing of what the folder is for.
-"""
+"""Start to write into a folder: make it, lock it, and leave nothing behind if the start fails."""
 
 import contextlib
 import errno

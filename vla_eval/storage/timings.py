@@ -1,8 +1,4 @@
-"""Read `timings.jsonl`: wall-clock seconds per episode. No result depends on it.
-
-A file that is not there, or a line that was torn when the machine went down, is a timing that is not known;
-never a zero.
-"""
+"""Read `timings.jsonl`: wall-clock seconds per episode; what is not there is not known, never zero."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

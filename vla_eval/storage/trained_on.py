@@ -1,8 +1,4 @@
-"""Which episodes of an evaluation have seeds whose demonstrations their policy was trained on.
-
-An episode's world is a function of task and seed: there, the policy is tested on what it was shown. Knows
-nothing of files.
-"""
+"""Which episodes of an evaluation have seeds whose demonstrations their policy was trained on."""
 
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,4 @@
-"""One fine-tuning, resolved once: recipe, dataset, policy, base, folders, where it resumes.
-
-Everything that can be refused is refused here, before the run has a folder. Knows nothing of the loop.
-"""
+"""One fine-tuning, resolved once: all that can be refused is refused here, before the run has a folder."""
 
 import os
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""The rules for demonstrations, one row each; docs/datasets.md has the same table (tested).
-
-`refused` stops what was asked for; `kept` is said, and nothing is changed.
-"""
+"""The rules for demonstrations, one row each; docs/datasets.md has the same table (tested)."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence

@@ -1,7 +1,4 @@
-"""Replay the stored actions of a dataset in the simulator: the contract between data and environment.
-
-The result is written into the dataset, so that training can refuse one whose actions no longer succeed.
-"""
+"""Replay the stored actions of a dataset in the simulator, and write into it whether they still succeed."""
 
 from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""Write a dataset's card: `README.md` with the Hub's front matter, and a contact sheet.
-
-The same dataset gives the same card: no date, no machine's name, everything in a fixed order.
-"""
+"""Write a dataset's card, the same for the same dataset: the Hub's `README.md` and a contact sheet."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""The last layers of the positive control: from what was decided, and the way to the goal, to a chunk.
-
-docs/positive_control.md, “Action”, says why where the arm goes and when are layers of their own.
-"""
+"""The last layers of the positive control, from the goal to a chunk: docs/positive_control.md, “Action”."""
 
 import math
 

@@ -1,7 +1,4 @@
-"""Where the positive control goes: each look-up says where the place that it found lies in the world.
-
-See docs/positive_control.md, “Goal”.
-"""
+"""Where the positive control goes, from what its look-ups found: docs/positive_control.md, “Goal”."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,8 +1,4 @@
-"""The fields by which a policy is given earlier frames: an image and a mask for each place and camera.
-
-A place that holds no frame has a mask of False: the model's own attention mask then leaves its image out, so
-that its values are of no effect.
-"""
+"""The fields by which a policy is given earlier frames: an image and a mask for each place and camera."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,4 @@
-"""A published checkpoint of another program, as a family's converter reads it. Knows no names of weights.
-
-No code of the checkpoint is run, and only safetensors are read here.
-"""
+"""A published checkpoint of another program, as a converter reads it: safetensors, none of its code."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

@@ -1,7 +1,4 @@
-"""A safetensors file read one tensor at a time, so that a checkpoint is never in memory twice.
-
-Knows only files and tensors. A tensor that is read is a copy: the file is mapped only while it is copied.
-"""
+"""A safetensors file, one copied tensor at a time, so that a checkpoint is never in memory twice."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Mapping

@@ -1,7 +1,4 @@
-"""Published results as data, from `published.yaml`, which ships with the package. Knows no format.
-
-A value that a source does not state is None. They are printed below measured rows, never among them.
-"""
+"""Published results as data, from `published.yaml`; a value that a source does not state is None."""
 
 import functools
 from collections.abc import Iterator

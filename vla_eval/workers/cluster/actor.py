@@ -1,7 +1,4 @@
-"""The inside of a cluster's actor: one worker process with its watchdog, or one policy server.
-
-An actor has a pool of one process, with the limits, guard and messages of the pool of one machine.
-"""
+"""The inside of a cluster's actor: a pool of one worker process, with its watchdog, or one policy server."""
 
 import os
 import sys
