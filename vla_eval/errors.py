@@ -6,8 +6,11 @@ and what to do next.
 """
 
 import difflib
+import re
 from collections.abc import Collection, Iterable
 
+_WORD = re.compile(r"\d+(?:x\d+)*|[A-Z]?[a-z]+|.")
+"""A number, or a word, within a name."""
 MAX_SHOWN = 200  # characters of what the user wrote that a message repeats
 MAX_NAMED = 6  # items of a list that a message names
 
@@ -154,6 +157,8 @@ def some_of(items: Iterable[object]) -> str:
 def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `" Did you mean 'x'?"` for the closest known name, or `""` if none is close.
 
+    Where one number or word of it is wrong, as in `RememberColor4-v0`, all that stand there are named.
+
     Args:
         name: what the user wrote.
         known: the names that exist. Comparing ignores case.
@@ -161,7 +166,22 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     by_folded = {candidate.lower(): candidate for candidate in known}
     # Longer names are not typos, and comparing takes time that grows with the square of the length.
     close = difflib.get_close_matches(name[:MAX_SHOWN].lower(), list(by_folded), n=1, cutoff=0.5)
-    return f" Did you mean '{by_folded[close[0]]}'?" if close else ""
+    if not close:
+        return ""
+    meant = _levels(name, by_folded[close[0]], by_folded.values()) or [by_folded[close[0]]]
+    return f" Did you mean '{"' or '".join(meant)}'?"
+
+
+def _levels(name: str, closest: str, known: Iterable[str]) -> list[str]:
+    """Return the names that differ from the closest in its number or word alone that is wrong in this one."""
+    words = _WORD.findall(closest)
+    for index, word in enumerate(words):
+        before, after = "".join(words[:index]), "".join(words[index + 1 :])
+        family = f"{re.escape(before)}(%s){re.escape(after)}"
+        found = re.fullmatch(family % "[a-z]*|[0-9x]*", name, re.IGNORECASE)
+        if found and (word[0].isdigit() or not difflib.get_close_matches(found[1], [word])):
+            return [one for one in known if re.fullmatch(family % _WORD.pattern, one)][:MAX_NAMED]
+    return []
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "") -> UnknownNameError:

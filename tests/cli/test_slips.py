@@ -1,11 +1,16 @@
 """What people type for what they mean: each gets a reply that names what is meant, or is understood."""
 
+import argparse
 import json
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
 from vla_eval.cli.main import build_parser, main
+from vla_eval.errors import did_you_mean
+from vla_eval.tasks.catalog import FAMILIES, TASKS
 
 EVAL = "eval --task RememberColor3-v0 --policy oracle --set simulator=fake"
 # Command line -> words that its reply must have.
@@ -33,7 +38,10 @@ SLIPS = {
     f"{EVAL} --policy=": "--policy: expected a value, found empty text",
     "eval --tasks RememberColor3-v0": "Did you mean '--task'?",
     "eval --model act": "Did you mean '--policy'?",
-    "eval --task RememberColor4-v0 --policy oracle": "Did you mean 'RememberColor",
+    "record --task RememberColor4-v0": "'RememberColor3-v0' or 'RememberColor5-v0' or 'RememberColor9-v0'?",
+    "record --task InterceptHard-v0": "'InterceptFast-v0' or 'InterceptMedium-v0' or 'InterceptSlow-v0'?",
+    "eval --task RememberColour3-v0 --policy oracle": "Did you mean 'RememberColor3-v0'?",
+    "eval --task RememberColor3-v0 --policy memory_color4": "Did you mean 'memory_color3'?",
     "record --task RememberColor3-v0 --seed 7": "Did you mean '--seed-start'?",
     "record --task RememberColor3-v0 --set delay_steps=7": "Did you mean 'env.delay_steps'?",
     "probe --task RememberColor3-v0 --policy oracle --set delay_steps=7": "'env.delay_steps'",
@@ -74,9 +82,33 @@ def test_numbers_are_separated_by_blanks_or_commas(typed: str) -> None:
         assert getattr(args, name) == [1, 4, 8]
 
 
-def test_a_flag_that_is_given_twice_adds_its_numbers() -> None:
-    line = "eval --n-action-steps 1 --n-action-steps 4,8"
-    assert build_parser(("eval",)).parse_args(line.split()).n_action_steps == [1, 4, 8]
+def list_flags(parser: argparse.ArgumentParser) -> Iterator[tuple[str, argparse.Action]]:
+    for action in parser._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            for name, verb in action.choices.items():
+                yield from ((f"{name} {words}".rstrip(), found) for words, found in list_flags(verb))
+        elif action.option_strings and action.nargs == "+" and action.help != argparse.SUPPRESS:
+            yield "", action
+
+
+@pytest.mark.parametrize(
+    ("verb", "action"),
+    list(list_flags(build_parser())),
+    ids=lambda of: of if isinstance(of, str) else of.dest,
+)
+def test_a_flag_with_several_values_is_given_once(
+    verb: str, action: argparse.Action, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flag = action.option_strings[0]
+    rest = (
+        ["x", "--out", "y"] if verb.startswith("checkpoint") else ["x"] if verb in ("replay", "view") else []
+    )
+    value = "RememberColor3-v0" if flag == "--task" else "light" if action.type is str else "1"
+    once = [*verb.split(), *rest, flag, value]
+    build_parser((once[0],)).parse_args([*once, value])  # both after one flag
+    with pytest.raises(SystemExit):
+        build_parser((once[0],)).parse_args([*once, flag, value])
+    assert f"{flag}: is given twice. Name all after one: {flag} A B." in capsys.readouterr().err
 
 
 def test_an_empty_variable_is_called_empty(capsys: pytest.CaptureFixture[str]) -> None:
@@ -98,3 +130,14 @@ def test_a_task_without_its_version_is_recorded_by_its_full_name(
         (record,) = map(json.loads, Path(run, "episodes.jsonl").read_text().splitlines())
         assert record["task"] == "RememberColor3-v0"
         assert json.loads(Path(run, "run.json").read_text())["config"]["tasks"] == ["RememberColor3-v0"]
+
+
+@pytest.mark.parametrize("task", [one for one in TASKS if re.search(r"\d-v0", one)])
+@pytest.mark.parametrize("case", [str, str.lower])
+def test_a_number_that_no_task_has_is_answered_with_those_of_its_family(
+    task: str, case: Callable[[str], str]
+) -> None:
+    family = re.sub(r"[\dx]+-v0$", "", task)
+    levels = sorted(one for one in TASKS if re.fullmatch(rf"{family}[\dx]+-v0", one))
+    meant = did_you_mean(case(re.sub(r"[\dx]+-v0$", "8-v0", task)), [*TASKS, *FAMILIES])
+    assert sorted(re.findall(r"'(.+?)'", meant)) == levels

@@ -52,7 +52,7 @@ def test_each_episode_has_one_cause() -> None:
     )
     assert report is not None
     assert report.causes == {
-        **{"right": 1, "not_finished": 1, "forgot": 1, "position_habit": 0},
+        **{"right": 1, "not_finished": 1, "wrong": 1, "position_habit": 0},
         **{"never_chose": 1, "could_not_move": 1},
     }
 
@@ -74,7 +74,7 @@ def test_wrong_choices_that_always_go_to_one_place_are_a_habit_and_not_forgettin
     assert habit is not None
     assert (habit.index, habit.n_chosen, habit.n_possible, habit.by_luck) == (2, 10, 10, 0.5)
     assert habit.p_value == pytest.approx(3 / 2**10)
-    assert (report.causes["position_habit"], report.causes["forgot"]) == (10, 0)
+    assert (report.causes["position_habit"], report.causes["wrong"]) == (10, 0)
 
 
 def test_a_policy_that_remembers_has_no_habit_even_if_the_target_is_always_at_one_place() -> None:
@@ -91,7 +91,7 @@ def test_even_guessing_is_forgetting_and_no_habit() -> None:
     assert report is not None
     habit = report.habits["place"]
     assert habit is not None and habit.p_value == 1.0  # 3 x P(at least 2 of 4) = 3 x 11/16, at most 1
-    assert report.causes["forgot"] == 6
+    assert report.causes["wrong"] == 6
 
 
 def test_with_two_candidates_a_wrong_choice_says_nothing_of_habits() -> None:

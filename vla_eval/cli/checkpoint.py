@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import add_old_flag
+from vla_eval.cli.shared.arguments import MANY, add_old_flag
 from vla_eval.errors import MAX_SHOWN, CheckpointError
 from vla_eval.models.families import FAMILIES, bases
 from vla_eval.models.family import Family, imported
@@ -56,7 +56,8 @@ def _add_convert(actions: "argparse._SubParsersAction[Any]") -> None:
         convert.add_argument("--out", metavar="DIR", required=True, help="folder to write")
         for flag in flags_of(imported(family.convert_options)).values():
             choices = {"choices": tuple(flag.values)} if flag.values else {}
-            convert.add_argument(flag.name, **choices, **flag.settings)
+            several = MANY if "nargs" in flag.settings else {}
+            convert.add_argument(flag.name, **choices, **{**several, **flag.settings})
             if flag.former:
                 add_old_flag(convert, flag.former, flag.name, nargs=flag.settings.get("nargs"))
 

@@ -6,6 +6,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import (
+    MANY,
     add_flags,
     add_old_flag,
     dry_run_options,
@@ -45,12 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     parser.add_argument(
         "--policy",
-        nargs="+",
+        **MANY,
         metavar="NAME",
         help="recipe in policies/ with a `finetune` section; of a table: its rows",
     )
     parser.add_argument(
-        "--task", nargs="+", type=task_argument, dest="tasks", metavar="T", help="of a table: its tasks"
+        "--task", **MANY, type=task_argument, dest="tasks", metavar="T", help="of a table: its tasks"
     )
     parser.add_argument("--dataset", metavar="DIR", help="folder of one dataset, or a folder that holds one")
     parser.add_argument("--steps", type=int, metavar="N", help="gradient steps (the recipe's)")

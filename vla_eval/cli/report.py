@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_eval.cli.shared.arguments import MANY
 from vla_eval.cli.shared.output import add_table_arguments, print_in, print_table
 from vla_eval.cli.terminal.screen import print_markdown
 
@@ -36,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="also print the summary figure of this protocol (`mikasa-vla list protocols`); those that the "
         "runs name are always printed",
     )
-    columns = parser.add_argument("--columns", nargs="+", default=[], metavar="NAME")
+    columns = parser.add_argument("--columns", **MANY, default=[], metavar="NAME")
     columns.help = "only these, in this order, in formats for reading: %(names)s"
     vars(columns)["names"] = _ColumnNames()  # argparse puts it into the help
     parser.add_argument(

@@ -29,7 +29,7 @@ EXPLANATIONS: dict[Cause, Explanation] = {
         "right choice, not finished",
         "the first candidate touched was right, but the task was not completed",
     ),
-    "forgot": Explanation("wrong choice", "a wrong candidate was touched first"),
+    "wrong": Explanation("wrong choice", "a wrong candidate was touched first"),
     "position_habit": Explanation(
         "position habit", "a wrong candidate was touched first, at the place that wrong choices prefer"
     ),

@@ -9,7 +9,7 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import LEVEL, p_above
 from vla_eval.results.grouping import RowEpisodes
 
-Cause = Literal["right", "not_finished", "forgot", "position_habit", "never_chose", "could_not_move"]
+Cause = Literal["right", "not_finished", "wrong", "position_habit", "never_chose", "could_not_move"]
 CAUSES: tuple[Cause, ...] = get_args(Cause)
 Kind = Literal["item", "place"]
 
@@ -101,4 +101,4 @@ def _cause(record: EpisodeRecord, habit: Habit | None) -> Cause:
     if record.first_choice_success:
         return "right" if record.success_once else "not_finished"
     is_habit = habit is not None and habit.is_found and record.first_choice_place == habit.index
-    return "position_habit" if is_habit else "forgot"
+    return "position_habit" if is_habit else "wrong"

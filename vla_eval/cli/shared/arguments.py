@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from vla_eval.cli.shared.slips import Numbers, numbers
+from vla_eval.cli.shared.slips import Several, numbers
 from vla_eval.config.files import Folder, load_recipe
 from vla_eval.errors import RecipeError
 from vla_eval.results.formats import FORMATS
@@ -135,8 +135,8 @@ def task_argument(text: str) -> str:
     return with_version(text)
 
 
-MANY: Mapping[str, Any] = {"nargs": "+", "action": "extend"}
-NUMBERS: Mapping[str, Any] = {"nargs": "+", "action": Numbers, "type": numbers}
+MANY: Mapping[str, Any] = {"nargs": "+", "action": Several}
+NUMBERS: Mapping[str, Any] = {**MANY, "type": numbers}
 FLAGS: Mapping[str, Mapping[str, Any]] = {
     "--task": {**MANY, "type": task_argument, "dest": "tasks", "metavar": "T", "help": "task ids"},
     "--policy": {**MANY, "dest": "policies", "metavar": "P", "help": "names, files or folders"},

@@ -97,8 +97,8 @@ def about_empty(arguments: Sequence[str]) -> str | None:
     return None
 
 
-class Numbers(argparse.Action):
-    """Reads numbers that are separated by blanks or commas: `1 4 8`, `1,4,8` and `1, 4, 8`."""
+class Several(argparse.Action):
+    """Takes all values of a flag that is given once: given again, it may mean more of them, or others."""
 
     def __call__(
         self,
@@ -107,11 +107,13 @@ class Numbers(argparse.Action):
         values: object,
         option_string: str | None = None,
     ) -> None:
-        """Add the numbers to those of the flag before."""
-        found = [number for one in values for number in one] if isinstance(values, list) else []
-        given = getattr(namespace, self.dest, None)
-        earlier = given if isinstance(given, list) and given is not self.default else []
-        setattr(namespace, self.dest, [*earlier, *found])
+        """Store the values; those of `numbers` may be several in a word."""
+        if getattr(namespace, self.dest, self.default) is not self.default:
+            raise argparse.ArgumentError(self, f"is given twice. Name all after one: {option_string} A B.")
+        parts = values if isinstance(values, list) else [values]
+        setattr(
+            namespace, self.dest, [v for part in parts for v in (part if isinstance(part, list) else [part])]
+        )
 
 
 def numbers(text: str) -> list[int]:
