@@ -11,9 +11,10 @@ import pytest
 
 import vla_eval
 from tests.training import tiny_trainings
+from vla_eval.api import probing
 from vla_eval.cli.main import main
 from vla_eval.core import ActionChunk
-from vla_eval.errors import VlaEvalError
+from vla_eval.errors import FolderInUseError, VlaEvalError
 from vla_eval.specs import PolicySpec
 from vla_eval.training.finetune import finetune
 
@@ -62,6 +63,25 @@ def test_a_policy_of_a_notebook_is_probed_as_a_named_one_is(tmp_path: Path) -> N
     assert main([*arguments, *small, "--out", str(tmp_path / "verb")]) == 0
     named = vla_eval.run_probe(policy="hold", out=tmp_path / "verb", **settings)  # all is there
     assert str(named.table()).replace("hold", "mine") == str(probe.table())
+
+
+def test_a_world_that_another_process_is_writing_comes_last(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tried: list[str] = []
+
+    def run_or_resume(*_: Any, out: Path, **__: Any) -> None:
+        tried.append(out.name)
+        if len(tried) == 1:
+            raise FolderInUseError(f"{out}: another process (pid 1) is writing into it.")
+
+    monkeypatch.setattr(probing, "run_or_resume", run_or_resume)
+    monkeypatch.setattr(probing, "read_probe", lambda worlds, out: len(worlds))
+    monkeypatch.setattr(probing, "write_retention", lambda *_: ())
+    found = vla_eval.run_probe(policy="oracle", tasks=TASK, probes=["swap", "blank"], out=tmp_path)
+    first, *others = tried
+    assert len(tried) == found.found + 1 and others[-1] == first
+    assert "another process is writing into it; it comes last." in capsys.readouterr().err
 
 
 TINY = {"policy": tiny_trainings.TINY_ACT, "num_workers": 0, "save_every_steps": 2}

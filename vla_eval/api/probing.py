@@ -12,6 +12,7 @@ from vla_eval.api.configured import listed
 from vla_eval.api.evaluating import entries_of, eval_config, run_or_resume
 from vla_eval.api.run import Text, in_colors, notebook_html
 from vla_eval.cli.probe import EPISODES, INTERVENTIONS, OUT, probe_settings
+from vla_eval.cli.shared.evaluations import in_turn
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.probe.interventions import plan_probe
@@ -92,14 +93,17 @@ def run_probe(
     for pair in probe.left_out:
         print(f"left out: {pair}", file=sys.stderr)
     objects = {one.name: one for one in entries if isinstance(one, PolicyEntry)}
-    for world in probe.worlds:
+
+    def run(folder: Path, config: EvalConfig) -> None:
         run_or_resume(
-            world.config,
-            [objects.get(name, name) for name in world.config.policies],
-            out=Path(out) / world.config.name,
+            config,
+            [objects.get(name, name) for name in config.policies],
+            out=folder,
             in_process=in_process,
             allow_environment_change=allow_environment_change,
             command="vla_eval.run_probe(…)",
         )
+
+    in_turn([(Path(out) / world.config.name, world.config) for world in probe.worlds], run)
     found = read_probe(probe.worlds, Path(out))
     return ProbeResult(out=Path(out), found=found, plots=tuple(write_retention(found, Path(out))))

@@ -3,7 +3,7 @@
 import argparse
 import itertools
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -41,23 +41,39 @@ def evaluate_each(
 ) -> Evaluations:
     """Run or resume each evaluation, (run folder, configuration); a signal stops it and those after it.
 
-    One that another process is writing comes last, so that several processes share the work.
+    Of `args`: `--shard`, `--allow-environment-change` and `--json-progress`.
     """
     n_errors = 0
-    put_off: list[tuple[Path, EvalConfig]] = []
     with progress.stop_on_signals() as stop:
-        for out, config in itertools.chain(runs, put_off):  # which grows meanwhile
-            try:
-                resolved = resolve(config, backend=backend, out=out, shard=args.shard)
-                summary = evaluate_one(resolved, args, stop=stop)
-            except FolderInUseError:
-                if (out, config) in put_off:
-                    raise
-                print(f"{out}: another process is writing into it; it comes last.", file=sys.stderr)
-                put_off.append((out, config))
-                continue
+
+        def run(out: Path, config: EvalConfig) -> bool:
+            nonlocal n_errors
+            resolved = resolve(config, backend=backend, out=out, shard=args.shard)
+            summary = evaluate_one(resolved, args, stop=stop)
             n_errors += summary.n_errors
-            if summary.was_stopped:
-                print(f"Stopped. To resume: {typed_command()}", file=sys.stderr)
-                return Evaluations(n_errors, stop.exit_code)
-    return Evaluations(n_errors, None)
+            return summary.was_stopped
+
+        was_stopped = in_turn(runs, run)
+    if was_stopped:
+        print(f"Stopped. To resume: {typed_command()}", file=sys.stderr)
+    return Evaluations(n_errors, stop.exit_code if was_stopped else None)
+
+
+def in_turn(
+    runs: Iterable[tuple[Path, EvalConfig]], run: Callable[[Path, EvalConfig], bool | None]
+) -> bool | None:
+    """Run each until one returns that it was stopped, which is returned.
+
+    One that another process is writing comes last, so that several processes share the work.
+    """
+    put_off: list[tuple[Path, EvalConfig]] = []
+    for out, config in itertools.chain(runs, put_off):  # which grows meanwhile
+        try:
+            if run(out, config):
+                return True
+        except FolderInUseError:
+            if (out, config) in put_off:
+                raise
+            print(f"{out}: another process is writing into it; it comes last.", file=sys.stderr)
+            put_off.append((out, config))
+    return False
