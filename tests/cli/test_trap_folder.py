@@ -4,7 +4,9 @@ import argparse
 import contextlib
 import functools
 import importlib.metadata
+import json
 import os
+import signal
 import subprocess
 import sys
 import threading
@@ -49,9 +51,10 @@ WITH_LEROBOT = {
 STARTED_ALIKE = {"bench --loader", "bench --serve", "probe"}
 """Commands whose processes are those of `finetune`, `eval --serve` and `eval`."""
 ENDED = "This command ended with "
+FORKED = "This command runs in process "
 # What an earlier command has imported is not searched for again, and springs no trap: look at each import.
 ONE_AFTER_ANOTHER = f"""
-import builtins, os, sys
+import builtins, json, os, sys
 from vla_eval.cli.main import main
 
 def import_and_look(*args, **kwargs):
@@ -60,16 +63,28 @@ def import_and_look(*args, **kwargs):
         os._exit(70)
     return really_import(*args, **kwargs)
 
+def code_of(command):
+    try:
+        return main(command.split())
+    except SystemExit as ends:
+        return ends.code
+
 if __name__ == "__main__":
     here, really_import = {{"", ".", os.getcwd()}}, builtins.__import__
     builtins.__import__ = import_and_look
     commands = os.fdopen(os.dup(0))
     os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
-    for command in commands:
-        try:
-            code = main(command.split())
-        except SystemExit as ends:
-            code = ends.code
+    for line in commands:
+        is_endless, command = json.loads(line)
+        if not is_endless:
+            code = code_of(command)
+        elif pid := os.fork():  # it has what the commands before it have imported
+            print("{FORKED}", pid, flush=True)
+            code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+        else:
+            code = code_of(command)
+            sys.stdout.flush()
+            os._exit(code)
         print("{ENDED}", code, flush=True)
 """
 
@@ -98,20 +113,19 @@ class Traps:
         self._mark.unlink(missing_ok=True)
         return {int(pid): what for pid, _, what in (line.partition(" ") for line in reversed(lines))}
 
-    def run(self, command: str, *, until: str | None = None, **environment: str) -> tuple[int, int, str]:
-        """Return process id, exit code and output of a command; one that does not end is stopped."""
+    def run(self, command: str, **environment: str) -> tuple[int, int, str]:
+        """Return process id, exit code and output of a command."""
         with self._started(command_line(command, self.work), **environment) as process:
             assert process.stdout is not None
-            said = ""
-            for line in process.stdout:
-                said += line
-                if until is not None and until in line:
-                    process.terminate()
+            said = process.stdout.read()
             return process.pid, process.wait(), said
 
     @contextlib.contextmanager
-    def one_process(self) -> Iterator[Callable[[str], tuple[int, str]]]:
-        """Start a process; the function that it yields has it run a command, and returns code and output."""
+    def one_process(self) -> Iterator[Callable[[str, str | None], tuple[int, str]]]:
+        """Start a process; the function that it yields has it run a command, and returns code and output.
+
+        A command that does not end runs in a fork, and is stopped when it has printed a word.
+        """
         interpreter, command = command_line("", self.work)
         program = Path(command).with_name("one-after-another")
         program.write_text(ONE_AFTER_ANOTHER)
@@ -119,14 +133,19 @@ class Traps:
             asked, answers = process.stdin, process.stdout
             assert asked is not None and answers is not None
 
-            def run(command: str) -> tuple[int, str]:
-                print(command.replace("{W}", str(self.work)), file=asked, flush=True)
-                said = ""
+            def run(command: str, until: str | None) -> tuple[int, str]:
+                asking = (until is not None, command.replace("{W}", str(self.work)))
+                print(json.dumps(asking), file=asked, flush=True)
+                said, pid = "", 0
                 for line in answers:
                     before, ended, code = line.partition(ENDED)
                     said += before
-                    if ended:
+                    if line.startswith(FORKED):
+                        pid = int(line.removeprefix(FORKED))
+                    elif ended:
                         return int(code), said
+                    elif until is not None and until in line:
+                        os.kill(pid, signal.SIGTERM)
                 raise AssertionError(f"{command}: the process has ended: {said}")
 
             yield run
@@ -170,9 +189,12 @@ def test_there_is_a_command_of_every_verb() -> None:
 
 
 def named(*, with_lerobot: bool) -> list[str]:
-    """Return the commands of one of the two processes that run them one after another."""
+    """Return the commands of one of the two processes that run them one after another.
+
+    Those that do not end come last: they need the most imports, and find them there.
+    """
     own = {name for name in COMMANDS if (name in WITH_LEROBOT) is with_lerobot}
-    return [name for name in COMMANDS if name in own - STARTED_ALIKE]
+    return sorted((name for name in COMMANDS if name in own - STARTED_ALIKE), key=ENDLESS.__contains__)
 
 
 @pytest.mark.parametrize(
@@ -186,15 +208,15 @@ def named(*, with_lerobot: bool) -> list[str]:
 def test_no_process_of_any_verb_imports_from_the_working_directory(
     traps: Traps, names: Collection[str], each_alone: Collection[str]
 ) -> None:
-    """One process, started as a command is, runs them; those that do not end have one of their own."""
+    """One process, started as a command is, runs them; those that do not end run in a fork of it."""
     caught = {}
     with traps.one_process() as run_there:
         for name in names:
             command = COMMANDS[name]
-            if name not in each_alone and name not in ENDLESS:
-                code, said = run_there(command)
+            if name in each_alone:
+                _, code, said = traps.run(command)
             else:
-                _, code, said = traps.run(command, until=ENDLESS.get(name))
+                code, said = run_there(command, ENDLESS.get(name))
             if name in ENDLESS:
                 assert ENDLESS[name] in said, f"{name}: {said}"
             else:
