@@ -103,11 +103,12 @@ def run(
     log: ActionLog | None = None,
     env: SimEnv | None = None,
     horizon_steps: int | None = None,
+    stop_at_success: bool = False,
 ) -> list[EpisodeRecord]:
     env = privileged_env(task) if env is None else env
     policy = make_policy(policy_name, env, n_action_steps)
     chunking = ChunkingSpec(n_action_steps=n_action_steps, first_inference_step=first_inference_step)
-    settings = RolloutSettings(chunking=chunking)
+    settings = RolloutSettings(chunking=chunking, stop_at_success=stop_at_success)
     horizon = horizon_steps or env.spec.horizon_steps
     records = []
     for seed in seeds:
@@ -188,7 +189,8 @@ def _window_with_target(result: StepResult, target: int) -> Any:
     ],
 )
 def test_a_blind_arm_chooses_at_chance(task: str, n_episodes: int) -> None:
-    records = run(task, "cue_blind", range(1, n_episodes + 1))
+    # Of 60 steps it needs 20 for its first choice.
+    records = run(task, "cue_blind", range(1, n_episodes + 1), horizon_steps=30)
     n_candidates = records[0].n_candidates
     assert n_candidates is not None
     # A fair coin of 1/N fails this once in 10,000 times; an arm that knows or never arrives always does.
@@ -225,7 +227,7 @@ def test_hold_keeps_arm_and_gripper_where_they_are() -> None:
 
 
 def test_a_tour_finds_the_mug_without_memory_and_begins_at_chance() -> None:
-    records = run("ShellGameTouch-v0", "tour", range(1, 6))
+    records = run("ShellGameTouch-v0", "tour", range(1, 6), stop_at_success=True)
     assert n_successes(records) == 5
     # An arm that knew would be right 5 times; by chance that many come once in 3^5 = 243 times.
     assert sum(bool(record.first_choice_success) for record in records) < 5
@@ -286,7 +288,7 @@ def test_staying_at_the_place_of_the_cue_wins_cube_tasks_only_where_touching_the
 
 def test_staying_over_the_ball_wins_the_shell_game() -> None:
     """The arm is nearer to its mug than to any other when they appear, so its place keeps the answer."""
-    assert n_successes(run("ShellGameTouch-v0", "cue_touch", range(1, 6))) == 5  # by luck: 0.4 %
+    assert n_successes(run("ShellGameTouch-v0", "cue_touch", range(1, 6), stop_at_success=True)) == 5  # by luck: 0.4 %
 
 
 @pytest.mark.parametrize(
@@ -294,7 +296,7 @@ def test_staying_over_the_ball_wins_the_shell_game() -> None:
 )
 def test_an_arm_that_sees_one_frame_at_a_time_meets_the_ball(task: str) -> None:
     """It is never told the ball's speed, and keeps nothing: the same frame gets the same answer."""
-    assert n_successes(run(task, "one_frame", range(101, 107))) >= 5  # the blind arm: 2 of 10 and 1 of 10
+    assert n_successes(run(task, "one_frame", range(101, 107), stop_at_success=True)) >= 5  # the blind arm: 2 of 10 and 1 of 10
     unknown = {"velocity_m_s": np.full(3, np.nan)}
     assert one_frame_decides(task, hidden={"ball": unknown}) == 40
 
@@ -302,7 +304,7 @@ def test_an_arm_that_sees_one_frame_at_a_time_meets_the_ball(task: str) -> None:
 def test_an_arm_that_sees_one_frame_at_a_time_takes_the_cube_back() -> None:
     """The cube lies on its way back. The arm is never told from where it came, and keeps nothing."""
     # The blind arm succeeds in 11 of 30: 6 of 6 come by its luck once in 400 times.
-    assert n_successes(run("TakeItBack-v0", "one_frame", range(101, 107))) == 6
+    assert n_successes(run("TakeItBack-v0", "one_frame", range(101, 107), stop_at_success=True)) == 6
     unknown = {"position_m": np.full(3, np.nan)}
     assert one_frame_decides("TakeItBack-v0", hidden={"first_place": unknown}) == 40
 

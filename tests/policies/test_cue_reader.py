@@ -8,7 +8,8 @@ from vla_eval.errors import SpecMismatchError
 
 
 def digests(task: str, policy: str, *, k: int, first: int) -> list[str | None]:
-    records = run(task, policy, (1, 2), n_action_steps=k, first_inference_step=first)
+    # The choice begins at step 10.
+    records = run(task, policy, (1, 2), n_action_steps=k, first_inference_step=first, horizon_steps=24)
     return [record.trajectory_sha256 for record in records]
 
 
@@ -36,8 +37,8 @@ def test_of_a_chain_a_cue_reader_knows_the_cubes_that_were_there_at_its_inferenc
     shown: dict[int, tuple[int, ...]] = {}
     right: list[tuple[int, ...]] = []
     task = "ChainOfColors3-v0"
-    (reader,) = run(task, "cue_reader", [1], n_action_steps=5, log=Shown())
-    (oracle,) = run(task, "oracle", [1], n_action_steps=5)
+    (reader,) = run(task, "cue_reader", [1], n_action_steps=5, log=Shown(), horizon_steps=50)
+    (oracle,) = run(task, "oracle", [1], n_action_steps=5, horizon_steps=50)
     assert reader.trajectory_sha256 == oracle.trajectory_sha256
     one, two, three = right[0]
     expected = [(one,)] * 4 + [(two,)] * 5 + [(three,)] * 5 + [()] * 5

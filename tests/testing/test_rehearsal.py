@@ -1,8 +1,6 @@
 """A rehearsal writes random weights of a recipe's shapes, loads them strictly, acts, and leaves nothing."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ from safetensors.torch import load_file
 from scipy.fft import idct
 from transformers import AutoTokenizer
 
+from tests.forked import run_forked
 from vla_eval.checkpoints.fast_tokens import load_fast_tokenizer
 from vla_eval.checkpoints.loading import make_unfilled_policy
 from vla_eval.config.finetuning import FinetuneConfig
@@ -62,8 +61,8 @@ def test_a_tiny_recipe_is_written_loaded_and_acts(recipe: str, tiny: bool, tmp_p
 def test_the_command_prints_json_and_stays_within_the_limit(tmp_path: Path) -> None:
     """In a process of its own: the memory of this one depends on the tests before."""
     arguments = ["openvla_oft_tiny", "--out", str(tmp_path / "r"), "--device", "cpu", "--format", "json"]
-    command = [sys.executable, "-m", "vla_eval.cli", "checkpoint", "rehearse", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True)
+    command = ["checkpoint", "rehearse", *arguments]
+    done = run_forked(f"from vla_eval.cli.main import main; raise SystemExit(main({command}))", tmp_path)
     assert done.returncode == 0, done.stderr
     printed = json.loads(done.stdout)
     assert printed["is_within_limit"]
