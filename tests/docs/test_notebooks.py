@@ -42,10 +42,14 @@ def test_a_notebook_runs_from_the_first_cell_to_the_last(path: Path, tmp_path: P
     copy.write_text(json.dumps(notebook), encoding="utf-8")
     program = str(ROOT / "scripts" / "notebooks.py")
     if path.stem == "your_policy":
-        done = subprocess.run([sys.executable, program, str(copy)], cwd=tmp_path, capture_output=True, text=True)
+        done = subprocess.run(
+            [sys.executable, program, str(copy)], cwd=tmp_path, capture_output=True, text=True
+        )
     else:  # in a process that has imported what a model needs
         arguments = [program, "--here", str(copy)]
-        script = f"import runpy, sys; sys.argv = {arguments}; runpy.run_path({program!r}, run_name='__main__')"
+        script = (
+            f"import runpy, sys; sys.argv = {arguments}; runpy.run_path({program!r}, run_name='__main__')"
+        )
         done = run_forked(script, tmp_path)
     assert done.returncode == 0, done.stderr
     for ran, stored in zip(code_cells(read(copy)), code_cells(read(path)), strict=True):

@@ -86,6 +86,8 @@ def test_an_inference_between_two_items_sees_none_of_them() -> None:
 def test_a_grid_runs_on_its_own_and_resumes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["probe", "--grid", "--task", TASK, "--policy", "hold", *FAKE, "--episodes", "6"]
     out = tmp_path / "grid"
+    # The response begins at step 10; the oracle needs 20 steps more if its first chunk is 5 steps late.
+    command += ["--set", "env.horizon_steps=36"]
     command += ["--n-action-steps", "1", "8", "--delay", "5", "--out", str(out), "--format"]
     assert main([*command, "json"]) == 0
     found = json.loads(capsys.readouterr().out)

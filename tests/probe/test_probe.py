@@ -72,7 +72,8 @@ def rows_of(found: dict[str, Any], intervention: str) -> dict[str, dict[str, Any
 def test_controls_follow_the_swapped_cue_as_far_as_they_know_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], one_place: str
 ) -> None:
-    arguments = ("--task", "RememberColor3-v0", "--policy", one_place, "--probe", "swap")
+    short = ("--set", "env.horizon_steps=30")  # the choice begins at step 10
+    arguments = ("--task", "RememberColor3-v0", "--policy", one_place, *short, "--probe", "swap")
     found = probe(tmp_path / "paper", capsys, *arguments, "interference")
     paper, moved = rows_of(found, "swap"), rows_of(found, "interference")
     assert {row["n_pairs"] for row in paper.values()} == {N}

@@ -1,8 +1,9 @@
 """A training opens its dataset once: each file of it is read once for its content, and once per digest."""
 
 import builtins
-import inspect
 import io
+import sys
+import traceback
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,7 @@ class Reads:
         def counted(file: Any, *args: Any, **options: Any) -> Any:
             path = Path(file).resolve() if isinstance(file, str | Path) else Path()
             if path.is_relative_to(self.root) and path.suffix != ".mp4":
-                callers = [frame.function for frame in inspect.stack()]
+                callers = [frame.f_code.co_name for frame, _ in traceback.walk_stack(sys._getframe())]
                 purpose = next((DIGESTS[name] for name in callers if name in DIGESTS), "content")
                 self.counts[path.relative_to(self.root).as_posix(), purpose] += 1
             return read(file, *args, **options)

@@ -4,12 +4,13 @@ lerobot reads a frame by the times and places that the tables name: where these 
 frame without an error.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_eval.data.tables import refused
 from vla_eval.errors import DatasetError
@@ -73,18 +74,20 @@ def _check_videos(root: Path, meta: Any) -> None:
             if not all(isinstance(one, kinds) and 0 <= one < float("inf") for one in values):
                 raise refused(where, f"a number in each row of {column}", f"{values!s:.80}")
     for path, (camera, numbers) in episodes_by_video(meta).items():
-        _check_times(where, meta, path, camera, numbers)
+        columns = (f"videos/{camera}/from_timestamp", "dataset_from_index", "dataset_to_index")
+        spans = [np.array(rows[name], dtype=np.float64)[numbers] for name in columns]
+        _check_times(where, path, numbers, spans, fps=meta.fps)
         if (root / path).is_file():
             check_mp4(root / path, DatasetError)
 
 
-def _check_times(where: Path, meta: Any, path: Path, camera: str, numbers: list[int]) -> None:
+def _check_times(
+    where: Path, path: Path, numbers: list[int], spans: Sequence[NDArray[np.float64]], *, fps: float
+) -> None:
     """Raise `DatasetError` where two episodes have frames of a video in common."""
-    rows = meta.episodes
-    columns = (f"videos/{camera}/from_timestamp", "dataset_from_index", "dataset_to_index")
-    begins_s, firsts, stops = (np.array(rows[name], dtype=np.float64)[numbers] for name in columns)
-    ends_s = begins_s + (stops - firsts) / meta.fps
-    half_frame_s = 0.5 / meta.fps
+    begins_s, firsts, stops = spans
+    ends_s = begins_s + (stops - firsts) / fps
+    half_frame_s = 0.5 / fps
     for before, after in pairwise(np.argsort(begins_s, kind="stable")):
         if begins_s[after] < ends_s[before] - half_frame_s:
             one, other = numbers[before], numbers[after]
