@@ -257,3 +257,43 @@ def test_a_mapping_of_tasks_is_one_policy_with_a_checkpoint_for_each() -> None:
     ]
     with pytest.raises(RecipeError, match="expected the folder of a checkpoint for each task"):
         entries_of({"mine": {"RememberColor3-v0": Still()}})
+
+
+@pytest.mark.parametrize("given", [Still, Still()], ids=["class", "instance"])
+def test_the_same_call_in_this_process_leaves_the_class_as_it_is_and_resumes(
+    given: object, tmp_path: Path
+) -> None:
+    act, settings = Still.act, {**FAST, "tasks": TASK, "episodes": 1, "in_process": True, "out": tmp_path}
+    first = vla_eval.evaluate(policy={"mine": given}, **settings)
+    assert Still.act is act  # the copy's methods would read a copy of this module's variables
+    again = vla_eval.evaluate(policy={"mine": given}, **settings)
+    assert str(first.table("csv")) == str(again.table("csv"))
+
+
+def test_numbers_of_numpy_are_numbers(tmp_path: Path) -> None:
+    run = vla_eval.evaluate(
+        **{**FAST, "episodes": 1, "in_process": True, "tasks": TASK, "out": tmp_path},
+        policy="oracle",
+        n_action_steps=np.array([1, 4]),
+    )
+    assert list(run.to_pandas(kind="episodes")["n_action_steps"]) == [1, 4]
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: vla_eval.evaluate(policy="oracle", task=TASK), "'task'. Did you mean 'tasks'?"),
+        (lambda: vla_eval.check_policy(Bare()), "`act` returns an ActionChunk. Found: ndarray."),
+    ],
+)
+def test_a_slip_in_a_call_is_answered_with_what_is_meant(call: Any, words: str) -> None:
+    with pytest.raises(VlaEvalError) as raised:
+        call()
+    assert words in str(raised.value)
+
+
+class Bare(Still):
+    """Returns an array in place of a chunk."""
+
+    def act(self, window: ObservationWindow) -> Any:
+        return super().act(window).actions

@@ -8,7 +8,7 @@ import pytest
 
 import vla_eval
 from vla_eval.cli.main import main
-from vla_eval.errors import RunFolderError, UnknownNameError
+from vla_eval.errors import RunFolderError, UnknownNameError, VlaEvalError
 
 TASK = "RememberColor3-v0"
 
@@ -85,3 +85,10 @@ def test_only_markdown_is_offered_to_notebooks_as_markdown(run: vla_eval.Run) ->
     assert run.table()._repr_markdown_() == str(run.table())
     assert run.table("latex")._repr_markdown_() is None  # IPython then shows the text
     assert repr(run.table("csv")) == str(run.table("csv"))
+
+
+def test_a_word_that_is_no_format_and_no_comparison_is_refused(run: vla_eval.Run) -> None:
+    with pytest.raises(VlaEvalError, match="no format 'text'"):
+        run.table("text")  # type: ignore[arg-type]
+    with pytest.raises(VlaEvalError, match="way to compare 'k'"):
+        run.compare(by="k")  # type: ignore[arg-type]

@@ -1,11 +1,12 @@
 """Configurations from the arguments of a function: what a verb makes of a file and flags."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any  # plain data, whatever the user gives
 
 from vla_eval.config.files import Folder, load_recipe, to_data
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, check_names
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import with_version
 
@@ -47,6 +48,7 @@ def configured[C](
         return load_recipe(folder, str(config), cls, edit=complete).value
     data = dict(start) if config is None else to_data(config)
     complete(data)
+    check_names("field", data, [one.name for one in fields(cls)], where=where)  # type: ignore[arg-type]
     missing = [argument for field, argument in needed.items() if field not in data]
     if missing:
         raise RecipeError(
@@ -65,7 +67,9 @@ EXAMPLES = {
 
 
 def listed(value: Any) -> list[Any] | None:
-    """Return one or several as a list; None stays."""
+    """Return one or several as a list, numbers of numpy as Python's; None stays."""
     if value is None:
         return None
+    if hasattr(value, "tolist"):
+        value = value.tolist()
     return list(value) if isinstance(value, (list, tuple, range)) else [value]

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any, Literal, Self  # plain data
 
 from markupsafe import Markup
 
-from vla_eval.errors import unknown_name
+from vla_eval.errors import check_names, unknown_name
 from vla_eval.page.build import write_page
 from vla_eval.page.material import gather
 from vla_eval.page.rates import success_plots
 from vla_eval.page.svg import FONT_SIZE_PX, PALETTE
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.formats import By, Format, Preset
+from vla_eval.results.formats import FORMATS, By, Format, Preset
 from vla_eval.results.report import build_table, render
 from vla_eval.results.sweep import DEFAULT_DIFFERENCE, compare_runs
 from vla_eval.results.sweep_format import render_sweep
@@ -33,6 +33,7 @@ class Text(str):
 
     def __new__(cls, text: str, format: Format) -> Self:
         """Take the text and what it is written in."""
+        check_names("format", [format], FORMATS)
         made = super().__new__(cls, text)
         made.written_in = format
         return made

@@ -73,7 +73,7 @@ def given_entry(found: object, *, name: str | None = None) -> PolicyEntry:
             f"policy '{name}': policies/ has a recipe of this name. Give another: policy={{'my_{name}': …}}"
         )
     try:
-        pickled = cloudpickle.dumps(found)
+        pickled = _dumped(found, _Copier)
     except Exception as exc:  # whatever the objects in it raise
         raise RecipeError(
             f"policy '{name}': expected an object that can be copied to worker processes, found one that "
@@ -95,9 +95,7 @@ def identity_of(found: object) -> str:
 
     A digest that differs without need only starts a new run folder.
     """
-    buffer = io.BytesIO()
-    _Describer(buffer).dump(found)
-    digest = hashlib.sha256(buffer.getvalue())
+    digest = hashlib.sha256(_dumped(found, _Describer))
     of_class = found if inspect.isclass(found) else type(found)
     modules = {one.__module__ for one in of_class.__mro__} | {getattr(found, "__module__", "")}
     for module in sorted(modules - {"__main__"}):
@@ -107,18 +105,30 @@ def identity_of(found: object) -> str:
     return digest.hexdigest()
 
 
-class _Describer(cloudpickle.Pickler):  # type: ignore[misc]  # cloudpickle is untyped
-    """Pickles an object for its digest alone: without line numbers and file names, which cells change."""
+class _Copier(cloudpickle.Pickler):  # type: ignore[misc]  # cloudpickle is untyped
+    """Pickles a class of a notebook without its id, by which a copy overwrites the original."""
 
     def reducer_override(self, obj: Any) -> Any:
         """Return how an object is pickled."""
-        if isinstance(obj, types.CodeType):
-            return tuple, (_facts(obj),)
         reduced = super().reducer_override(obj)
         if isinstance(obj, type) and isinstance(reduced, tuple):
             args = (None if isinstance(one, str) and _CLASS_ID.fullmatch(one) else one for one in reduced[1])
             reduced = (reduced[0], tuple(args), *reduced[2:])
         return reduced
+
+
+class _Describer(_Copier):
+    """Pickles an object for its digest alone: without line numbers and file names, which cells change."""
+
+    def reducer_override(self, obj: Any) -> Any:
+        """Return how an object is pickled."""
+        return (tuple, (_facts(obj),)) if isinstance(obj, types.CodeType) else super().reducer_override(obj)
+
+
+def _dumped(found: object, pickler: type[_Copier]) -> bytes:
+    buffer = io.BytesIO()
+    pickler(buffer).dump(found)
+    return buffer.getvalue()
 
 
 def _facts(code: types.CodeType) -> tuple[Any, ...]:

@@ -3,11 +3,11 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 import scipy
 
-from vla_eval.errors import ReportError, unknown_name
+from vla_eval.errors import ReportError, check_names, unknown_name
 from vla_eval.results.comparison import Comparison, Evidence, compare, gather_evidence
 from vla_eval.results.estimates import LEVEL
 from vla_eval.results.formats import By
@@ -81,6 +81,7 @@ def compare_runs(
         ReportError: there are no episodes, nothing to compare, or an impossible difference.
         UnknownNameError: there is no such reference.
     """
+    check_names("way to compare", [by], get_args(By), where="by")
     if not 0 < difference <= 1:
         raise ReportError(f"--difference is {difference}, expected a number above 0 and up to 1.")
     runs = list({run.path.resolve(): run for run in runs}.values())

@@ -226,6 +226,7 @@ class _Runs:
         return ObservationWindow(slot=episode.slot, frames=frames)
 
     def _check(self, chunk: ActionChunk, *, earlier: Sequence[ActionChunk], seed: int) -> None:
+        claim(isinstance(chunk, ActionChunk), "`act` returns an ActionChunk.", type(chunk).__name__)
         actions = chunk.actions
         claim(
             actions.shape == self.chunk_shape and actions.dtype == np.float32,
