@@ -7,7 +7,7 @@ import pytest
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
-from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POS, EE_DELTA_POSE, JOINT_POS
+from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POS, EE_DELTA_POSE, EE_POSE, JOINT_POS
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameError
@@ -15,11 +15,14 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_oracle
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.arguments import offered_by
+from vla_eval.tasks.arm import drives
+from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_env import check_env
 
 TASK = "RememberColor3-v0"
 MODES = tuple(CONTROL_MODES)
+FETCH = {"robot_uids": FETCH_UID}
 
 
 def env_in(mode: str, task: str = TASK, **kwargs: Any) -> Any:
@@ -40,6 +43,29 @@ def test_names_and_bounds_of_an_action_are_those_of_the_simulator_s_controller(m
 @pytest.mark.parametrize("mode", MODES[1:])
 def test_an_environment_in_another_mode_keeps_the_contract(mode: str) -> None:
     check_env(lambda: env_in(mode), renders=False, n_steps=4)
+
+
+@pytest.mark.parametrize(("mode", "other_arm"), [*((mode, {}) for mode in MODES), (EE_DELTA_POSE, FETCH)])
+def test_the_arm_moves_as_with_maniskill_s_own_controllers_to_the_last_bit(
+    mode: str, other_arm: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # Also beyond the bounds, where numbers are clipped and rotations shortened.
+    space, n_steps = CONTROL_MODES[mode], 40
+    drawn = np.random.default_rng(0).uniform(space.low, space.high, (n_steps, len(space.dims))) * 1.5
+    states = []
+    for table in (drives.DRIVES, {}):  # without a row, a controller keeps ManiSkill's own way
+        monkeypatch.setattr(drives, "DRIVES", table)
+        env = env_in(mode, **other_arm)
+        env.reset({0: 5}, render=False)
+        actions = drawn.copy()
+        if mode == EE_POSE:  # every other pose is one that the arm can reach
+            actions[::2] = env.hold_action(0) + actions[::2] / 50
+        results = [env.step({0: action.astype(np.float32)}, render=frozenset())[0] for action in actions]
+        states.append([result.observation.state[name] for result in results for name in ("qpos", "qvel")])
+        states[-1].append(env.joint_targets(0))
+        env.close()
+    np.testing.assert_equal(states[0], states[1])
+    assert np.ptp(states[0][:-1:2], axis=0).max() > 0.1, "the arm did not move"
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -67,7 +67,7 @@ def test_a_motion_in_the_delay_replaces_the_action_there_and_nowhere_else() -> N
     executed = []
     for _ in range(12):
         env.step(asked)
-        executed.append(env.executed_action[0].numpy())
+        executed.append(env.executed_action[0])
     env.close()
     assert asked.tolist() == np.full((1, 7), 0.1, dtype=np.float32).tolist()  # the caller's is untouched
     for step, action in enumerate(executed):

@@ -59,7 +59,7 @@ def test_only_strict_rotation_looks_at_the_place(shift_m: float, lenient: bool, 
     for task, expected in (("RotateLenientPos-v0", lenient), ("RotateStrictPos-v0", strict)):
         env = make(task)
         env.reset(seed=[3])
-        place = env._first_position[0] + torch.tensor([shift_m, 0, 0])
+        place = env._first_position[0] + np.array([shift_m, 0, 0])
         yaw = float(env._first_yaw[0] + env.prompt()[0, 0])
         info = put(env, env.peg, place.tolist(), yaw)
         assert bool(info["success"][0]) is expected
@@ -71,8 +71,8 @@ def test_only_strict_rotation_looks_at_the_place(shift_m: float, lenient: bool, 
 def test_the_angle_asked_for_is_observed_beside_the_pictures_and_not_in_the_state() -> None:
     env = make("RotateLenientPos-v0")
     _, info = env.reset(seed=[1])
-    assert torch.equal(info["task_cue"], env.prompt())
-    assert torch.equal(env._get_obs_extra(info)["task_cue"], env.prompt())
+    assert np.array_equal(info["task_cue"], env.prompt())
+    assert np.array_equal(env._get_obs_extra(info)["task_cue"], env.prompt())
     # The oracle's number is what is left to be turned: at the start the whole angle.
     assert float(info["oracle_info"][0]) == pytest.approx(float(env.prompt()[0, 0]), abs=1e-4)
 
@@ -102,7 +102,7 @@ def test_the_disc_turns_violet_when_the_cube_comes_and_stays_so_if_latched(latch
         at_goal = [
             name
             for name, disc in (("red", env.red_disc), ("violet", env.violet_disc))
-            if torch.allclose(disc.pose.p[0], env._goal_position[0], atol=1e-4)
+            if np.allclose(disc.pose.p[0], env._goal_position[0], atol=1e-4)
         ]
         return " and ".join(at_goal)
 

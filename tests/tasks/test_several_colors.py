@@ -4,14 +4,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from tests.tasks import made_tasks
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.memory_env import PARK_X_M
 from vla_eval.tasks.sequences import bunch_place_m
 
-ABOVE_CUBE_M = torch.tensor([0.0, 0.0, 0.036])  # within 2 cm of the point to touch, 1 cm over the cube
+ABOVE_CUBE_M = np.array([0.0, 0.0, 0.036])  # within 2 cm of the point to touch, 1 cm over the cube
 
 
 ENVS: dict[str, Any] = {}
@@ -27,7 +26,7 @@ def make(task: str, **kwargs: Any) -> Any:
 
 def visible(env: Any) -> list[int]:
     x = env.candidate_positions_m()[0, :, 0]
-    return [int(i) for i in torch.nonzero(x < PARK_X_M - 1)[:, 0]]
+    return [int(i) for i in np.flatnonzero(x < PARK_X_M - 1)]
 
 
 def touch(env: Any, index: int, n_steps: int = 16) -> Any:
@@ -35,8 +34,8 @@ def touch(env: Any, index: int, n_steps: int = 16) -> Any:
     goal = env.candidate_positions_m()[0, index] + ABOVE_CUBE_M
     rewards, info = [], None
     for _ in range(n_steps):
-        action = torch.zeros(1, 7)
-        action[0, :3] = (9 * (goal - env.tcp_position_m()[0])).clamp(-1, 1)
+        action = np.zeros((1, 7), dtype=np.float32)
+        action[0, :3] = (9 * (goal - env.tcp_position_m()[0])).clip(-1, 1)
         action[0, 6] = 1
         _, reward, *_, info = env.step(action)
         rewards.append(float(reward[0]))
@@ -62,10 +61,10 @@ def test_a_bunch_is_shown_together_and_then_all_cubes_lie_still_on_the_table() -
         assert visible(env) == (shown if step < 5 else [] if step < 10 else list(range(9))), step
         if step < 5:
             for index in shown:
-                expected = torch.tensor([*bunch_place_m(index, 9), 0.02])
-                assert torch.allclose(positions[index], expected, atol=2e-4)
+                expected = np.array([*bunch_place_m(index, 9), 0.02])
+                assert np.allclose(positions[index], expected, atol=2e-4)
         if step >= 10:
-            assert torch.allclose(positions, env._slots[0], atol=2e-4)
+            assert np.allclose(positions, env._slots[0], atol=2e-4)
         env.step(env.hold_action())
 
 
@@ -79,7 +78,7 @@ def test_a_sequence_is_shown_one_cube_after_another(task: str, n_shown: int) -> 
         if step < 5 * n_shown:
             assert visible(env) == [sequence[step // 5]], step
             place = env.candidate_positions_m()[0, sequence[step // 5]]
-            assert torch.allclose(place, torch.tensor([0, 0, 0.02]), atol=2e-4)
+            assert np.allclose(place, np.array([0, 0, 0.02]), atol=2e-4)
         else:
             assert visible(env) == ([] if step < 5 * n_shown + 5 else list(range(9))), step
         env.step(env.hold_action())
@@ -168,8 +167,8 @@ def test_a_touch_can_be_asked_to_last() -> None:
 def test_cubes_of_another_size_are_touched_half_a_centimetre_over_their_tops() -> None:
     env = begin("BunchOfColors3-v0", cube_half_size_m=0.015)
     centres = env.candidate_positions_m()[0]
-    assert torch.allclose(centres[:, 2], torch.tensor(0.015), atol=2e-4)
-    assert torch.allclose(env.touch_points_m()[0, :, 2], torch.tensor(0.015 + 0.015 + 0.005), atol=2e-4)
+    assert np.allclose(centres[:, 2], np.array(0.015), atol=2e-4)
+    assert np.allclose(env.touch_points_m()[0, :, 2], np.array(0.015 + 0.015 + 0.005), atol=2e-4)
 
 
 def test_bunches_sequences_and_chains_of_a_seed_differ() -> None:

@@ -10,6 +10,7 @@ import torch
 
 import vla_eval.tasks.register  # noqa: F401  # registers the gym ids
 from tests.tasks.made_tasks import make
+from vla_eval.core import FloatArray
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.memory_env import PARK_X_M
 
@@ -36,7 +37,7 @@ def trajectory(env: Any, seed: int, n_steps: int = 25) -> np.ndarray:
 def visible(env: Any) -> list[int]:
     """Indices of the candidates that are not parked."""
     x = env.candidate_positions_m()[0, :, 0]
-    return [int(i) for i in torch.nonzero(x < PARK_X_M - 1)[:, 0]]
+    return [int(i) for i in np.flatnonzero(x < PARK_X_M - 1)]
 
 
 @pytest.mark.parametrize(
@@ -93,19 +94,19 @@ def test_item_is_shown_hidden_and_then_all_items_lie_still_on_the_table(task: st
     for seed in (1, 2, 3):
         env.reset(seed=[seed])
         target = int(env.target_index()[0])
-        heights = torch.tensor([item.shape.rest_height_m for item in env.items])
+        heights = np.array([item.shape.rest_height_m for item in env.items])
         for step in range(20):
             positions = env.candidate_positions_m()[0]
             if step < 5:
                 assert visible(env) == [target], f"step {step}"
-                middle = torch.tensor([0, 0, float(heights[target])])
-                assert torch.allclose(positions[target], middle, atol=2e-4)
+                middle = np.array([0, 0, float(heights[target])])
+                assert np.allclose(positions[target], middle, atol=2e-4)
             elif step < 10:
                 assert visible(env) == [], f"step {step}"
             else:
                 assert len(visible(env)) == env.n_items, f"step {step}"
-                assert torch.allclose(positions, env._slots[0], atol=2e-4)
-                assert torch.allclose(positions[:, 2], heights, atol=2e-4)
+                assert np.allclose(positions, env._slots[0], atol=2e-4)
+                assert np.allclose(positions[:, 2], heights, atol=2e-4)
             env.step(env.hold_action())
 
 
@@ -124,14 +125,14 @@ def test_ball_is_shown_and_then_mugs_stand_upright_on_the_table_one_over_the_bal
         env.reset(seed=[seed])
         target = int(env.target_index()[0])
         for step in range(30):
-            ball = env.ball.pose.p[0]
-            assert torch.allclose(ball[:2], env._slots[0, target, :2], atol=1e-3)
+            ball = env.ball.pose.p[0].numpy()
+            assert np.allclose(ball[:2], env._slots[0, target, :2], atol=1e-3)
             assert visible(env) == ([] if step < 5 else [0, 1, 2]), f"step {step}"
             if step >= 5:
                 mugs = env.candidate_positions_m()[0]
                 # Half of the mug's height: nothing is ejected, tilted or sunk, as in the official code.
-                assert torch.allclose(mugs[:, 2], torch.tensor(0.0405), atol=5e-4), f"step {step}"
-                assert torch.allclose(mugs[:, :2], env._slots[0, :, :2], atol=1e-3), f"step {step}"
+                assert np.allclose(mugs[:, 2], np.array(0.0405), atol=5e-4), f"step {step}"
+                assert np.allclose(mugs[:, :2], env._slots[0, :, :2], atol=1e-3), f"step {step}"
             env.step(env.hold_action())
 
 
@@ -157,7 +158,7 @@ def test_evaluate_changes_nothing(sampled_task: str) -> None:
         before = env.get_state().clone()
         first, second = env.evaluate(), env.evaluate()
         assert torch.equal(before, env.get_state())
-        assert all(torch.equal(first[key], second[key]) for key in first)
+        assert all(np.array_equal(first[key], second[key]) for key in first)
 
 
 def test_unseeded_resets_give_different_episodes() -> None:
@@ -166,9 +167,9 @@ def test_unseeded_resets_give_different_episodes() -> None:
     layouts = []
     for _ in range(3):
         env.reset()
-        layouts.append(env._slots.clone())
-    assert not torch.equal(layouts[0], layouts[1])
-    assert not torch.equal(layouts[1], layouts[2])
+        layouts.append(env._slots.copy())
+    assert not np.array_equal(layouts[0], layouts[1])
+    assert not np.array_equal(layouts[1], layouts[2])
 
 
 def test_the_same_seeds_have_independent_answers_in_different_tasks() -> None:
@@ -212,19 +213,19 @@ def test_success_and_states_do_not_depend_on_the_reward_mode(sampled_task: str) 
     assert all(rows == outcomes[0] for rows in outcomes)
 
 
-def go_to(env: Any, goal: torch.Tensor, n_steps: int) -> Any:
+def go_to(env: Any, goal: FloatArray, n_steps: int) -> Any:
     """Move the tool centre point to (3,) and return the last info."""
     info = None
     for _ in range(n_steps):
-        action = torch.zeros(1, 7)
-        action[0, :3] = (13 * (goal - env.tcp_position_m()[0])).clamp(-1, 1)
+        action = np.zeros((1, 7), dtype=np.float32)
+        action[0, :3] = (13 * (goal - env.tcp_position_m()[0])).clip(-1, 1)
         action[0, 6] = 1
         *_, info = env.step(action)
     return info
 
 
 def test_touching_the_cue_counts_only_without_the_phase_gate() -> None:
-    above_cue = torch.tensor([0.0, 0.0, 0.06])
+    above_cue = np.array([0.0, 0.0, 0.06])
     gated = make("RememberColor3-v0", cue_steps=30)
     gated.reset(seed=[1])
     assert not bool(go_to(gated, above_cue, 25)["success"][0])
@@ -238,7 +239,7 @@ def test_first_choice_is_latched_and_wrong_ones_are_counted() -> None:
     env.reset(seed=[2])
     target = int(env.target_index()[0])
     wrong = (target + 1) % 3
-    lift = torch.tensor([0.0, 0.0, 0.04])
+    lift = np.array([0.0, 0.0, 0.04])
     info = go_to(env, env._slots[0, wrong] + lift, 25)
     assert (int(info["first_choice"][0]), int(info["n_wrong_choices"][0])) == (wrong, 1)
     assert not bool(info["success"][0])
@@ -251,7 +252,7 @@ def test_strict_choice_makes_the_first_wrong_touch_a_failure_for_good() -> None:
     env = make("RememberColor3-v0", cue_steps=1, delay_steps=0, strict_choice=True)
     env.reset(seed=[2])
     target = int(env.target_index()[0])
-    lift = torch.tensor([0.0, 0.0, 0.04])
+    lift = np.array([0.0, 0.0, 0.04])
     assert bool(go_to(env, env._slots[0, (target + 1) % 3] + lift, 25)["fail"][0])
     info = go_to(env, env._slots[0, target] + lift, 25)
     assert bool(info["fail"][0])
@@ -299,7 +300,7 @@ def test_freeze_until_choice_holds_arm_and_gripper() -> None:
         env.step(moved)
     assert torch.allclose(env.agent.robot.get_qpos(), start, atol=2e-3)
     # What is recorded is what was carried out: no motion, fingers 4 cm from the middle, fully open.
-    assert torch.allclose(env.executed_action[0], torch.tensor([0.0] * 6 + [1.0]), atol=1e-2)
+    assert np.allclose(env.executed_action[0], np.array([0.0] * 6 + [1.0]), atol=1e-2)
     for _ in range(5):
         env.step(moved)
     assert not torch.allclose(env.agent.robot.get_qpos(), start, atol=2e-2)

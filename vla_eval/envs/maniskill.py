@@ -16,9 +16,9 @@ import torch
 
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
-from vla_eval.core import FloatArray, Observation, StepResult
+from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
-from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
+from vla_eval.envs.scenes import build, describe, take_human_image, take_images
 from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
@@ -70,8 +70,8 @@ class ManiSkillEnv:
                 self._seeds[slot] = seeds[slot]
             block = self._seeds[first : first + self._slots_per_env].tolist()
             env_idx = torch.tensor([slot - first for slot in slots], device=self._envs[index].device)
-            _, info = self._envs[index].reset(seed=block, options={"env_idx": env_idx})
-            results |= self._results(index, slots, info, None, frozenset(slots) if render else frozenset())
+            self._envs[index].reset(seed=block, options={"env_idx": env_idx})
+            results |= self._results(index, slots, frozenset(slots) if render else frozenset(), is_reset=True)
         return results
 
     def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
@@ -83,20 +83,21 @@ class ManiSkillEnv:
                 actions[slot] if slot in actions else self.hold_action(slot)
                 for slot in range(first, first + self._slots_per_env)
             ]
-            batch = torch.as_tensor(np.stack(rows), device=self._envs[index].device)
-            _, reward, _, _, info = self._envs[index].step(batch)
-            results |= self._results(index, slots, info, reward, render)
+            self._envs[index].advance(np.stack(rows))
+            results |= self._results(index, slots, render)
         return results
 
     def hold_action(self, slot: int) -> FloatArray:
         """Return the (A,) action that moves nothing; see `SimEnv.hold_action`."""
         index, row = divmod(slot, self._slots_per_env)
-        return to_array(self._envs[index].hold_action()[row])
+        action: FloatArray = self._envs[index].hold_action()[row]
+        return action
 
     def joint_targets(self, slot: int) -> FloatArray:
         """Return the (J,) joint positions, rad, at which the arm's controller aims since the last action."""
         index, row = divmod(slot, self._slots_per_env)
-        return to_array(self._envs[index].agent.controller.controllers["arm"]._target_qpos[row])
+        targets: FloatArray = self._envs[index].joint_targets()[row]
+        return targets
 
     def cue_boxes(self, slot: int) -> CueBoxes:
         """Return where in the images the cue is; see `CueLocator`."""
@@ -117,35 +118,38 @@ class ManiSkillEnv:
         return sorted(grouped.items())
 
     def _results(
-        self, index: int, slots: list[int], info: Any, reward: Any, render: frozenset[int]
+        self, index: int, slots: list[int], render: frozenset[int], *, is_reset: bool = False
     ) -> dict[int, StepResult]:
         env = self._envs[index]
-        executed = None if reward is None else env.executed_action
-        images = {}
-        if render.intersection(slots):
-            images = take_images(env, self._settings.cameras)
-            steps = (int(info["elapsed_steps"][slot % self._slots_per_env]) for slot in slots)
-            if any(self._settings.shows_human_camera(step, self.spec.horizon_steps) for step in steps):
-                images[HUMAN_CAMERA] = take_human_image(env)
-        state = robot_state(env)
+        info = env.read_info()
+        steps = [int(info["elapsed_steps"][slot % self._slots_per_env]) for slot in slots]
+        images = self._images(env, steps) if render.intersection(slots) else {}
+        state = {"tcp_pose": env.tcp_pose(), "qpos": env.qpos(), "qvel": env.qvel()}
         if env.PROMPT_DIMS:
             state["task_cue"] = env.prompt()
+        rewards = np.zeros(self._slots_per_env) if is_reset else env.normalized_reward(info)
         results = {}
         for slot in slots:
             row = slot % self._slots_per_env
             observation = Observation(
                 step=int(info["elapsed_steps"][row]),
                 images={name: batch[row].copy() for name, batch in images.items()} if slot in render else {},
-                state={name: to_array(batch[row]) for name, batch in state.items()},
+                state={name: batch[row].copy() for name, batch in state.items()},
                 privileged=env.true_state(info, row) if self._settings.privileged else None,
             )
             results[slot] = StepResult(
                 observation=observation,
                 status=env.status(info, row),
-                reward=0.0 if reward is None else float(reward[row]),
-                executed_action=None if executed is None else to_array(executed[row]),
+                reward=float(rewards[row]),
+                executed_action=None if is_reset else env.executed_action[row].copy(),
             )
         return results
+
+    def _images(self, env: Any, steps: list[int]) -> dict[str, ImageArray]:
+        images = take_images(env, self._settings.cameras)
+        if any(self._settings.shows_human_camera(step, self.spec.horizon_steps) for step in steps):
+            images[HUMAN_CAMERA] = take_human_image(env)
+        return images
 
 
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:

@@ -20,8 +20,8 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.envs.official_mug import provide_mug
 from vla_eval.envs.official_settings import check_official
-from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates
-from vla_eval.envs.scenes import build, describe, robot_state, take_human_image, take_images, to_array
+from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates, to_vector
+from vla_eval.envs.scenes import build, describe, take_human_image, take_images
 from vla_eval.envs.true_states import with_true_states
 from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, check_names
 from vla_eval.oracles.arm_model import gripper_command
@@ -29,7 +29,7 @@ from vla_eval.task_state import Phase, PrivilegedState, TaskStatus
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import ACTION, CAMERAS
-from vla_eval.tasks.objects.bodies import to_vector, yaw_rad
+from vla_eval.tasks.objects.bodies import to_array, yaw_rad
 from vla_eval.tasks.objects.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec
 
@@ -122,7 +122,7 @@ class OfficialEnv:
         return Observation(
             step=step,
             images={name: batch[0].copy() for name, batch in images.items()},
-            state={name: to_array(batch[0]) for name, batch in robot_state(env).items()},
+            state={name: to_array(batch[0]) for name, batch in _robot_state(env).items()},
             privileged=true_state,
         )
 
@@ -266,5 +266,10 @@ class OfficialEpisode:
             shown_candidates=right if is_shown else (),
             touched_candidates=tuple(self._choices.chosen),
             bodies=read_bodies(row, env, candidates, self._first),
-            tcp_yaw_rad=float(yaw_rad(tcp.pose.q)[0]),
+            tcp_yaw_rad=float(yaw_rad(to_array(tcp.pose.q))[0]),
         )
+
+
+def _robot_state(env: Any) -> dict[str, Any]:
+    robot = env.agent.robot
+    return {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from vla_eval.envs.true_states import PARKED_ABOVE_M
 from vla_eval.errors import SpecMismatchError
 from vla_eval.task_state import BodyState
-from vla_eval.tasks.objects.bodies import to_vector, yaw_rad
+from vla_eval.tasks.objects.bodies import to_array, yaw_rad
 from vla_eval.tasks.spec import TaskSpec
 
 Vector = NDArray[np.float64]
@@ -178,7 +178,7 @@ def _moving(actor: Any) -> BodyState:
     return BodyState(
         position_m=to_vector(pose.p[0]),
         velocity_m_s=to_vector(actor.linear_velocity[0]),
-        yaw_rad=float(yaw_rad(pose.q)[0]),
+        yaw_rad=float(yaw_rad(to_array(pose.q))[0]),
     )
 
 
@@ -188,3 +188,8 @@ def _place(actor: Any) -> BodyState:
 
 def _at(position_m: Vector, yaw: float = 0.0) -> BodyState:
     return BodyState(position_m=position_m, velocity_m_s=np.zeros(3), yaw_rad=yaw)
+
+
+def to_vector(tensor: Any) -> NDArray[np.float64]:  # Any: ManiSkill is untyped
+    """Return a tensor as new float64 numbers."""
+    return to_array(tensor).astype(np.float64)

@@ -1,13 +1,12 @@
-"""What adapters of ManiSkill environments share: images, renderer, tensors as arrays. Knows no tasks."""
+"""What adapters of ManiSkill environments share: images, the renderer's name. Knows no tasks."""
 
 from typing import Any  # ManiSkill is untyped: its environments and tensors are Any here
 
-import numpy as np
 import sapien
 import torch
 
 from vla_eval.config.environment import EnvSettings
-from vla_eval.core import FloatArray, ImageArray
+from vla_eval.core import ImageArray
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.errors import RenderingError
 
@@ -58,12 +57,6 @@ def build(cls: Any, settings: EnvSettings, **arguments: Any) -> Any:
         ) from exc
 
 
-def robot_state(env: Any) -> dict[str, Any]:
-    """Return the states that every task offers, as (B, …) tensors."""
-    robot = env.agent.robot
-    return {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}
-
-
 def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
     """Return the devices of an environment by what they are for."""
     device = {"simulator": str(env.backend.sim_backend)}
@@ -108,9 +101,3 @@ def take_human_image(env: Any) -> ImageArray:
     textures = camera.get_obs(rgb=True, depth=False, position=False, segmentation=False)
     image: ImageArray = textures["rgb"].cpu().numpy()
     return image
-
-
-def to_array(tensor: Any) -> FloatArray:
-    """Return a tensor as new float32 numbers."""
-    copied: FloatArray = tensor.detach().cpu().numpy().astype(np.float32, copy=True)
-    return copied

@@ -7,11 +7,12 @@ import numpy as np
 import sapien
 import torch
 from mani_skill.utils.building import actors
-from mani_skill.utils.structs import Pose
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.objects.bodies import Body, moving_body
+from vla_eval.tasks.memory_env import poses
+from vla_eval.tasks.objects.bodies import Body, Flags, moving_body, position_of, velocity_of
 from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
 
 SPAWN_X_M = (-0.35, -0.05)
@@ -56,8 +57,8 @@ class RollingBallEnv(WithoutCueEnv):
             name="ball",
             initial_pose=sapien.Pose(p=[SPAWN_X_M[0], SPAWN_Y_M[0], self._ball_start_z_m()]),
         )
-        self._start = torch.zeros(self.num_envs, 3, device=self.device)
-        self._initial_velocity = torch.zeros(self.num_envs, 3, device=self.device)
+        self._start: FloatArray = np.zeros((self.num_envs, 3), dtype=np.float32)
+        self._initial_velocity = np.zeros_like(self._start)
 
     def _ball_start_z_m(self) -> float:
         return self.ball_radius_m + self.BALL_DROP_M
@@ -69,8 +70,8 @@ class RollingBallEnv(WithoutCueEnv):
         motion = self.episode_generator(env, Stream.MOTION)
         side_m_s = motion.uniform(*SIDE_VELOCITY_M_S)
         velocity_m_s = (side_m_s, self._swapped_m_s(motion.uniform(*self.velocity_range_m_s)), 0.0)
-        self._start[env] = torch.tensor(start_m)
-        self._initial_velocity[env] = torch.tensor(velocity_m_s)
+        self._start[env] = start_m
+        self._initial_velocity[env] = velocity_m_s
 
     def n_swaps(self) -> int:
         """Return 1: a speed half of the range away; 0 if there is only one speed."""
@@ -88,19 +89,22 @@ class RollingBallEnv(WithoutCueEnv):
     def _sample_goal(self, env: int, layout: np.random.Generator, *, lane_x_m: float) -> None:
         """Draw the ball's goal, if it has one, after its start has been drawn."""
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
-        self.move(self.ball, mask, Pose.create_from_pq(self._start))
+    def _on_episode_start(self, mask: Flags) -> None:
+        self.move(self.ball, mask, poses(self._start))
         with self._only(mask):
-            self.ball.set_linear_velocity(self._initial_velocity[mask])
+            self.ball.set_linear_velocity(torch.as_tensor(self._initial_velocity[mask], device=self.device))
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `ball`."""
-        return {"ball": moving_body(self.ball.pose.p, self.ball.linear_velocity)}
+        return {"ball": moving_body(self.ball_position_m(), velocity_of(self.ball))}
 
-    def oracle_info(self) -> torch.Tensor:
+    def oracle_info(self) -> FloatArray:
         """Return (B, 3): the ball's initial velocity, m/s, world frame."""
         return self._initial_velocity
 
-    def _tcp_to_ball_m(self) -> torch.Tensor:
-        offset: torch.Tensor = self.ball.pose.p - self.tcp_position_m()
-        return offset
+    def ball_position_m(self) -> FloatArray:
+        """Return (B, 3): the ball's centre, world frame."""
+        return position_of(self.ball)
+
+    def _tcp_to_ball_m(self) -> FloatArray:
+        return self.ball_position_m() - self.tcp_position_m()

@@ -8,14 +8,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import torch
-from mani_skill.utils.structs import Actor, Pose
+from mani_skill.utils.structs import Actor
+from numpy.typing import NDArray
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.task_state import PrivilegedState, TaskStatus, only_one
-from vla_eval.tasks.memory_env import MemoryTableEnv, nearness
-from vla_eval.tasks.objects.bodies import length, to_vector
+from vla_eval.tasks.memory_env import MemoryTableEnv, Wxyz, nearness, poses
+from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere, length, positions_of
 from vla_eval.tasks.objects.layout import places_from_right
+from vla_eval.tasks.tensors_out import Info
 
 NO_CHOICE = -1
 
@@ -59,41 +61,41 @@ class ChoiceEnv(MemoryTableEnv):
     def _load_scene(self, options: dict[str, Any]) -> None:
         super()._load_scene(options)
         n_candidates = len(self.candidates)
-        self._target = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
-        self._slots = torch.zeros(self.num_envs, n_candidates, 3, device=self.device)
-        self._first_choice = torch.full_like(self._target, NO_CHOICE)
+        self._target: Indices = np.zeros(self.num_envs, dtype=np.int64)
+        self._slots: FloatArray = np.zeros((self.num_envs, n_candidates, 3), dtype=np.float32)
+        self._places: list[tuple[int, ...]] = [()] * self.num_envs
+        self._first_choice = np.full_like(self._target, NO_CHOICE)
         # 1 for the candidate that was touched first, 2 for the second …, 0 for those never touched.
-        self._touch_rank = torch.zeros(self.num_envs, n_candidates, dtype=torch.long, device=self.device)
-        self._touched_wrongly = torch.zeros_like(self._touch_rank, dtype=torch.bool)
+        self._touch_rank: Indices = np.zeros((self.num_envs, n_candidates), dtype=np.int64)
+        self._touched_wrongly: Flags = np.zeros_like(self._touch_rank, dtype=np.bool_)
+        self._rows = np.arange(self.num_envs)
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
+    def _on_episode_start(self, mask: Flags) -> None:
         self._first_choice[mask] = NO_CHOICE
         self._touch_rank[mask] = 0
         self._touched_wrongly[mask] = False
+        for env in np.flatnonzero(mask):
+            self._places[env] = places_from_right(self._slots[env, :, :2].astype(np.float64))
 
     def total_cue_steps(self, cue_steps: int) -> int:
         """Return the length of the cue phase, the steps before the cue included."""
         return self.cue_after_steps + super().total_cue_steps(cue_steps)
 
-    def candidate_positions_m(self) -> torch.Tensor:
+    def candidate_positions_m(self) -> FloatArray:
         """Return (B, N, 3): where the candidates are now, parked ones included, world frame."""
-        if self.gpu_sim_enabled:
-            return torch.stack([actor.pose.p for actor in self.candidates], dim=1)
-        # The same numbers without two tensors per candidate: this is called several times per step.
-        positions = [[body.pose.p for body in actor._objs] for actor in self.candidates]
-        return torch.as_tensor(np.array(positions, dtype=np.float32).swapaxes(0, 1))
+        return positions_of(self.candidates)
 
-    def final_positions_m(self) -> torch.Tensor:
+    def final_positions_m(self) -> FloatArray:
         """Return (B, N, 3): where the candidates are, or will be when the response phase begins."""
         revealed = self.response_begun()[:, None, None]
-        positions: torch.Tensor = torch.where(revealed, self.candidate_positions_m(), self._slots)
+        positions: FloatArray = np.where(revealed, self.candidate_positions_m(), self._slots)
         return positions
 
-    def touch_points_m(self) -> torch.Tensor:
+    def touch_points_m(self) -> FloatArray:
         """Return (B, N, 3): the points that the tool centre point must come near, world frame."""
         return self.candidate_positions_m()
 
-    def target_index(self) -> torch.Tensor:
+    def target_index(self) -> Indices:
         """Return (B,) the index of the candidate that is right now."""
         return self._target
 
@@ -103,7 +105,7 @@ class ChoiceEnv(MemoryTableEnv):
 
     def shown_candidates(self, env: int) -> tuple[int, ...]:
         """Return the right candidates of one environment's episode whose cue is in view now."""
-        step = int(self._elapsed_steps[env])
+        step = int(self.step_count()[env])
         in_view = self.cue_after_steps <= step < int(self._cue_end_step[env])
         return self.right_candidates(env) if in_view and self.show_cue else ()
 
@@ -116,63 +118,70 @@ class ChoiceEnv(MemoryTableEnv):
         """Return the success rate of a perfect arm that ignores the cue."""
         return 1 / len(self.candidates)
 
-    def target_distance_m(self) -> torch.Tensor:
+    def target_distance_m(self) -> FloatArray:
         """Return (B,) the distance from the tool centre point to the point to touch."""
-        return self._of_target(self._distances_m())
+        return length(self._of_target(self.touch_points_m()) - self.tcp_position_m())
 
-    def _distances_m(self) -> torch.Tensor:
-        return length(self.touch_points_m() - self.tcp_position_m()[:, None, :])
+    def _of_target(self, per_candidate: NDArray[Any]) -> NDArray[Any]:
+        found: NDArray[Any] = per_candidate[self._rows, self.target_index()]
+        return found
 
-    def _of_target(self, per_candidate: torch.Tensor) -> torch.Tensor:
-        return self._of_candidate(per_candidate, self.target_index())
-
-    def _of_candidate(self, per_candidate: torch.Tensor, index: torch.Tensor) -> torch.Tensor:
-        rows = torch.arange(self.num_envs, device=self.device)
-        return per_candidate[rows, index]
-
-    def _is_wrong(self, candidate: torch.Tensor) -> torch.Tensor:
+    def _is_wrong(self, candidate: Indices) -> Flags:
         """Return (B,) whether it would be wrong to touch these candidates, (B,) indices, now."""
-        return candidate != self._target
+        wrong: Flags = candidate != self._target
+        return wrong
 
-    def _update_latches(self, step: torch.Tensor) -> None:
-        distance, nearest = self._distances_m().min(dim=1)
-        touches = (distance <= self.goal_threshold_m) & self.is_static() & (step >= self._response_step)
-        self._latch_touch(touches, nearest)
+    def _update_latches(self, step: Steps) -> None:
+        begun = step >= self._response_step
+        if not anywhere(begun):
+            return
+        distances = length(self.touch_points_m() - self.tcp_position_m()[:, None, :])
+        nearest = distances.argmin(axis=1)
+        near = begun & (distances[self._rows, nearest] <= self.goal_threshold_m)
+        self._latch_touch(near & self.is_static() if anywhere(near) else near, nearest)
 
-    def _latch_touch(self, touches: torch.Tensor, candidate: torch.Tensor) -> None:
+    def _latch_touch(self, touches: Flags, candidate: Indices) -> None:
         """Record, where `touches` (B,) holds, that these candidates, (B,) indices, are touched."""
-        self._first_choice = torch.where(
-            touches & (self._first_choice == NO_CHOICE), candidate, self._first_choice
-        )
-        first_time = touches & (self._of_candidate(self._touch_rank, candidate) == 0)
+        if not anywhere(touches):
+            return
+        first = touches & (self._first_choice == NO_CHOICE)
+        self._first_choice[first] = candidate[first]
+        first_time = touches & (self._touch_rank[self._rows, candidate] == 0)
         wrong = first_time & self._is_wrong(candidate)
-        rank = (self._touch_rank > 0).sum(dim=1) + 1
-        rows = torch.arange(self.num_envs, device=self.device)
-        self._touch_rank[rows, candidate] += rank * first_time
-        self._touched_wrongly[rows, candidate] |= wrong
+        rank = (self._touch_rank > 0).sum(axis=1) + 1
+        self._touch_rank[self._rows, candidate] += rank * first_time
+        self._touched_wrongly[self._rows, candidate] |= wrong
 
-    def is_placed(self) -> torch.Tensor:
-        """Return (B,) bool: the success rule holds, except that the arm may still move."""
-        return self.target_distance_m() <= self.goal_threshold_m
+    def is_placed(self, reach_m: FloatArray) -> Flags:
+        """Return (B,) bool: the success rule holds, except that the arm may still move.
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+        Args:
+            reach_m: (B,) the distance of the tool centre point from the point to touch.
+        """
+        return reach_m <= self.goal_threshold_m
+
+    def evaluate(self) -> Info:
         """Read success, failure and choices; changes nothing."""
-        placed = self.is_placed()
-        static = self.is_static()
+        reach_m, static = self.target_distance_m(), self.is_static()
+        placed = self.is_placed(reach_m)
         success = self.gated(placed & static)
-        n_wrong = self._touched_wrongly.sum(dim=1)
-        lost = (n_wrong > 0) if self.strict_choice else torch.zeros_like(success)
+        n_wrong = self._touched_wrongly.sum(axis=1)
+        lost = (n_wrong > 0) if self.strict_choice else np.zeros_like(success)
         return {
             "success": success & ~lost,
             "fail": lost,
             "is_obj_placed": placed,
             "is_robot_static": static,
-            "obj_to_goal_pos": self._of_target(self.candidate_positions_m()) - self.tcp_position_m(),
-            "first_choice": self._first_choice.clone(),
+            "target_distance_m": reach_m,
+            "first_choice": self._first_choice.copy(),
             "n_wrong_choices": n_wrong,
         }
 
-    def status(self, info: dict[str, Any], env: int) -> TaskStatus:
+    def extra_info(self) -> Info:
+        """Return the way from the tool centre point to the point to touch, as the official code calls it."""
+        return {"obj_to_goal_pos": self._of_target(self.touch_points_m()) - self.tcp_position_m()}
+
+    def status(self, info: Info, env: int) -> TaskStatus:
         """Return the status, with what was chosen and what is right."""
         first, right = int(info["first_choice"][env]), self.right_candidates(env)
         return replace(
@@ -184,17 +193,17 @@ class ChoiceEnv(MemoryTableEnv):
             n_wrong_choices=int(info["n_wrong_choices"][env]),
             right_first_choices=right[:1] if self.in_order else right,
             chance_success=self.chance_success(),
-            candidate_places=places_from_right(self._slots[env, :, :2].cpu().numpy()),
+            candidate_places=self._places[env],
             right_candidates=right,
             touched_candidates=self.touched_candidates(env),
         )
 
-    def true_state(self, info: dict[str, Any], env: int) -> PrivilegedState:
+    def true_state(self, info: Info, env: int) -> PrivilegedState:
         """Return the true state, with the candidates and which are right."""
         right = self.right_candidates(env)
         return replace(
             super().true_state(info, env),
-            candidate_positions_m=to_vector(self.final_positions_m()[env]),
+            candidate_positions_m=self.final_positions_m()[env].astype(np.float64),
             target=only_one(right),
             right_candidates=right,
             shown_candidates=self.shown_candidates(env),
@@ -202,15 +211,15 @@ class ChoiceEnv(MemoryTableEnv):
             touched_candidates=self.touched_candidates(env),
         )
 
-    def oracle_info(self) -> torch.Tensor:
-        """Return (B,) uint8: the index of the right candidate."""
-        return self._target.to(torch.uint8)
+    def oracle_info(self) -> NDArray[np.uint8]:
+        """Return (B,): the index of the right candidate."""
+        return self._target.astype(np.uint8)
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Reach the right candidate, slow down there, stand still there (`docs/tasks.md`, rewards)."""
         placed = info["is_obj_placed"]
         return {
-            "reaching": nearness(self.REACH_SCALE_PER_M, self.target_distance_m()),
+            "reaching": nearness(self.REACH_SCALE_PER_M, info["target_distance_m"]),
             "slowing": self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed()) * placed,
             "resting": self.RESTING_WEIGHT * (info["is_robot_static"] & placed),
         }
@@ -218,11 +227,9 @@ class ChoiceEnv(MemoryTableEnv):
     SLOWING_WEIGHT = 1.0
     RESTING_WEIGHT = 1.0
 
-    def reveal(self, mask: torch.Tensor, orientation_wxyz: torch.Tensor) -> None:
-        """Move all candidates to their slots where the mask holds; orientation is (4,)."""
-        if not bool(mask.any()):
+    def reveal(self, mask: Flags, orientation_wxyz: FloatArray | Wxyz) -> None:
+        """Move all candidates to their slots where the mask holds; orientation is (4,) or (B, 4)."""
+        if not anywhere(mask):
             return
         for index, actor in enumerate(self.candidates):
-            positions = self._slots[:, index]
-            quaternions = orientation_wxyz.expand(self.num_envs, 4)
-            self.move(actor, mask, Pose.create_from_pq(positions, quaternions))
+            self.move(actor, mask, poses(self._slots[:, index], orientation_wxyz))

@@ -5,13 +5,23 @@ from typing import Any
 
 import numpy as np
 import sapien
-import torch
 from mani_skill.utils.building import actors
-from mani_skill.utils.structs import Pose
 
+from vla_eval.core import FloatArray
 from vla_eval.tasks.ball import RollingBallEnv
-from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.objects.bodies import Body, length, resting_body
+from vla_eval.tasks.memory_env import nearness, poses
+from vla_eval.tasks.objects.bodies import (
+    Body,
+    Flags,
+    Steps,
+    length,
+    pose_of,
+    position_of,
+    resting_body,
+    spin_of,
+    velocity_of,
+)
+from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import check_positive
 
 GOAL_OFFSET_X_M = 0.2
@@ -66,45 +76,42 @@ class InterceptEnv(RollingBallEnv):
             body_type="kinematic",
             initial_pose=sapien.Pose(p=[0, 0, GOAL_Z_M], q=list(UPWARDS_WXYZ)),
         )
-        self._goal_position = torch.zeros(self.num_envs, 3, device=self.device)
-        self._hit_point_reached = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
+        self._goal_position: FloatArray = np.zeros((self.num_envs, 3), dtype=np.float32)
+        self._hit_point_reached: Flags = np.zeros(self.num_envs, dtype=np.bool_)
 
     def _sample_goal(self, env: int, layout: np.random.Generator, *, lane_x_m: float) -> None:
-        place_m = (lane_x_m + GOAL_OFFSET_X_M, layout.uniform(*GOAL_Y_M), GOAL_Z_M)
-        self._goal_position[env] = torch.tensor(place_m)
+        self._goal_position[env] = (lane_x_m + GOAL_OFFSET_X_M, layout.uniform(*GOAL_Y_M), GOAL_Z_M)
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
+    def _on_episode_start(self, mask: Flags) -> None:
         self._hit_point_reached[mask] = False
         super()._on_episode_start(mask)
-        turned = torch.tensor(UPWARDS_WXYZ, device=self.device).expand(self.num_envs, 4)
-        self.move(self.goal, mask, Pose.create_from_pq(self._goal_position, turned))
+        self.move(self.goal, mask, poses(self._goal_position, UPWARDS_WXYZ))
 
-    def _ball_to_goal_m(self) -> torch.Tensor:
-        offset: torch.Tensor = self.goal.pose.p - self.ball.pose.p
-        return offset
+    def _ball_to_goal_m(self) -> FloatArray:
+        return position_of(self.goal) - self.ball_position_m()
 
-    def _hit_distance_m(self) -> torch.Tensor:
+    def _hit_distance_m(self) -> FloatArray:
         away = -self._ball_to_goal_m()
-        hit_point = self.ball.pose.p + HIT_OFFSET_M * (away / length(away)[:, None])
+        hit_point = self.ball_position_m() + HIT_OFFSET_M * (away / length(away)[:, None])
         return length(hit_point - self.tcp_position_m())
 
-    def _update_latches(self, step: torch.Tensor) -> None:
+    def _update_latches(self, step: Steps) -> None:
         self._hit_point_reached |= self._hit_distance_m() < HIT_REACHED_M
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def evaluate(self) -> Info:
         """Read success: the ball is over the disc at this step; changes nothing."""
         distance = length(self._ball_to_goal_m()[:, :2])
         return {
             "success": distance < self.goal_radius_m,
-            "reached_status": self._hit_point_reached.clone(),
+            "reached_status": self._hit_point_reached.copy(),
             "is_robot_static": self.is_static(),
         }
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `ball` and `goal`."""
-        return {**super().moving_bodies(), "goal": resting_body(self.goal.pose.p)}
+        return {**super().moving_bodies(), "goal": resting_body(position_of(self.goal))}
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Move behind the ball, then push the ball to the goal."""
         reached = self._hit_point_reached
         to_goal = length(self._ball_to_goal_m()[:, :2])
@@ -113,14 +120,13 @@ class InterceptEnv(RollingBallEnv):
             "aiming": 5 * nearness(1.0, to_goal) * reached,
         }
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
-        ball = self.ball.pose
+    def _privileged_extra(self) -> Info:
         return {
-            "goal_pos": self.goal.pose.p,
-            "ball_pose": ball.raw_pose,
+            "goal_pos": position_of(self.goal),
+            "ball_pose": pose_of(self.ball),
             "oracle_info": self.oracle_info(),
-            "ball_linear_velocity": self.ball.linear_velocity,
-            "ball_angular_velocity": self.ball.angular_velocity,
+            "ball_linear_velocity": velocity_of(self.ball),
+            "ball_angular_velocity": spin_of(self.ball),
             "tcp_to_ball_pos": self._tcp_to_ball_m(),
             "ball_to_goal_pos": self._ball_to_goal_m(),
         }

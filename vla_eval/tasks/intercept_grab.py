@@ -2,11 +2,13 @@
 
 from typing import Any
 
-import torch
+import numpy as np
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.ball import RollingBallEnv
 from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.objects.bodies import Flags, length, pose_of, spin_of, velocity_of
+from vla_eval.tasks.tensors_out import Info
 
 # The ball lies between the fingers: within this in x and in y of the tool centre point,
 GRIP_HALF_PLANE_M = 0.04
@@ -53,35 +55,30 @@ class InterceptGrabEnv(RollingBallEnv):
         self.lift_height_m = lift_height_m
         super().__init__(*args, **kwargs)
 
-    def _is_grasped(self) -> torch.Tensor:
-        """Return (B,) bool: both fingers press the ball with at least 0.5 N (ManiSkill's rule)."""
-        grasped: torch.Tensor = self.agent.is_grasping(self.ball)
-        return grasped
-
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def evaluate(self) -> Info:
         """Read success: the ball is grasped, high enough, and the arm at rest; changes nothing."""
-        grasped, static = self._is_grasped(), self.is_static()
+        grasped, static = self.grasps(self.ball), self.is_static()
         # The tolerance is for a ball that lies on the table: it sinks in by micrometres.
-        lifted = self.ball.pose.p[:, 2] >= self.ball_radius_m + self.lift_height_m - 1e-3
+        lifted = self.ball_position_m()[:, 2] >= self.ball_radius_m + self.lift_height_m - 1e-3
         return {
             "success": grasped & static & lifted,
             "is_ball_grasped": grasped,
             "is_robot_static": static,
         }
 
-    def _in_grip(self) -> torch.Tensor:
-        offset = self._tcp_to_ball_m().abs()
-        inside = (offset[:, :2] <= GRIP_HALF_PLANE_M).all(dim=1) & (offset[:, 2] <= GRIP_HALF_HEIGHT_M)
-        near = torch.linalg.norm(offset, dim=1) <= GRIP_RADIUS_M
-        held: torch.Tensor = inside & near & (self.gripper_width_m() >= BALL_DIAMETER_WIDTH_M)
+    def _in_grip(self) -> Flags:
+        offset = np.abs(self._tcp_to_ball_m())
+        inside = (offset[:, :2] <= GRIP_HALF_PLANE_M).all(axis=1) & (offset[:, 2] <= GRIP_HALF_HEIGHT_M)
+        near = length(offset) <= GRIP_RADIUS_M
+        held: Flags = inside & near & (self.gripper_width_m() >= BALL_DIAMETER_WIDTH_M)
         return held
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Reach the ball, get it between the fingers, close them, hold it."""
-        distance = torch.linalg.norm(self._tcp_to_ball_m(), dim=1)
+        distance = length(self._tcp_to_ball_m())
         width = self.gripper_width_m()
-        loose_m = ((width - BALL_DIAMETER_WIDTH_M).abs() - SNUG_M).clamp(min=0)
-        closing = 10 + 90 * torch.exp(-5 * loose_m) + 45 * (width <= NARROW_WIDTH_M)
+        loose_m = np.maximum(np.abs(width - BALL_DIAMETER_WIDTH_M) - SNUG_M, 0)
+        closing = 10 + 90 * np.exp(-5 * loose_m) + 45 * (width <= NARROW_WIDTH_M)
         return {
             "reaching": 10 * nearness(3.0, distance),
             "closing": closing * self._in_grip(),
@@ -89,14 +86,15 @@ class InterceptGrabEnv(RollingBallEnv):
             "holding": 100.0 * info["is_ball_grasped"],
         }
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+    def _privileged_extra(self) -> Info:
+        velocity_m_s = velocity_of(self.ball)
         return {
-            "ball_pose": self.ball.pose.raw_pose,
+            "ball_pose": pose_of(self.ball),
             "oracle_info": self.oracle_info(),
-            "is_ball_grasped": self._is_grasped()[:, None],
-            "ball_linear_velocity": self.ball.linear_velocity,
-            "ball_angular_velocity": self.ball.angular_velocity,
+            "is_ball_grasped": self.grasps(self.ball)[:, None],
+            "ball_linear_velocity": velocity_m_s,
+            "ball_angular_velocity": spin_of(self.ball),
             "tcp_to_ball_pos": self._tcp_to_ball_m(),
             "gripper_width": self.gripper_width_m()[:, None],
-            "relative_velocity": self.ball.linear_velocity - self.agent.tcp.linear_velocity,
+            "relative_velocity": velocity_m_s - velocity_of(self.agent.tcp),
         }

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import sapien
-import torch
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv
 from vla_eval.tasks.memory_env import CueSize, Place
+from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
 from vla_eval.tasks.objects.items import Item, build_decoy, build_item
 from vla_eval.tasks.objects.layout import Plane, jittered, slot_centres_m
 
@@ -61,7 +61,7 @@ class ItemChoiceEnv(ChoiceEnv):
             build_decoy(self.scene, item, initial_pose=self._decoy_parking_pose(item))
             for item in (self.items if uses_decoys else ())
         ]
-        self._distractor = torch.zeros(self.num_envs, dtype=torch.long, device=self.device)
+        self._distractor: Indices = np.zeros(self.num_envs, dtype=np.int64)
 
     def _check_distractor(self) -> None:
         least_delay = self.delay_steps_range[0]
@@ -88,27 +88,26 @@ class ItemChoiceEnv(ChoiceEnv):
         """Draw where each item lies in the response phase."""
         places = self._places_m(self.episode_generator(env, Stream.LAYOUT))
         order = self.episode_generator(env, Stream.PERMUTATION).permutation(self.n_items)
-        self._slots[env, :, :2] = torch.as_tensor(places[order], dtype=torch.float32)
-        heights = [item.shape.rest_height_m for item in self.items]
-        self._slots[env, :, 2] = torch.tensor(heights)
+        self._slots[env, :, :2] = places[order]
+        self._slots[env, :, 2] = [item.shape.rest_height_m for item in self.items]
 
     def _places_m(self, rng: np.random.Generator) -> Plane:
         """Draw the (N, 2) places of one episode."""
         return jittered(slot_centres_m(self.n_items), rng)
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
+    def _on_episode_start(self, mask: Flags) -> None:
         super()._on_episode_start(mask)
         self._park_all(mask)
         self._set_visible(mask, False)
 
-    def _park_all(self, mask: torch.Tensor) -> None:
-        if not bool(mask.any()):  # most steps: one check for all items, not one per item
+    def _park_all(self, mask: Flags) -> None:
+        if not anywhere(mask):  # most steps: one check for all items, not one per item
             return
         for item, actor in zip(self.items, self.candidates, strict=True):
             self.move(actor, mask, self._parking_pose(item))
         self._park_decoys(mask)
 
-    def _park_decoys(self, mask: torch.Tensor) -> None:
+    def _park_decoys(self, mask: Flags) -> None:
         for item, decoy in zip(self.items, self.decoys, strict=False):  # of no decoys or of all
             self.move(decoy, mask, self._decoy_parking_pose(item))
 
@@ -119,10 +118,10 @@ class ItemChoiceEnv(ChoiceEnv):
             drawn = self.episode_generator(env, Stream.DISTRACTOR).integers(len(others))
             self._distractor[env] = others[int(drawn)]
 
-    def _distract(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    def _distract(self, step: Steps, mask: Flags) -> Flags:
         """Show the distractor, or remove it, where its time begins or ends at `step`; return (B,) where."""
         if not self.distract_steps:
-            return torch.zeros_like(mask)
+            return np.zeros_like(mask)
         delay = self._response_step - self._cue_end_step
         first = self._cue_end_step + (delay - self.distract_steps) // 2
         begins, ends = mask & (step == first), mask & (step == first + self.distract_steps)
@@ -130,17 +129,18 @@ class ItemChoiceEnv(ChoiceEnv):
         for index, item in enumerate(self.items):
             middle = sapien.Pose(p=[0, 0, item.shape.rest_height_m])
             self.move(self.decoys[index], begins & (self._distractor == index), middle)
-        return begins | ends
+        either: Flags = begins | ends
+        return either
 
-    def _show_in_middle(self, mask: torch.Tensor, drawn: torch.Tensor, shown: torch.Tensor) -> None:
+    def _show_in_middle(self, mask: Flags, drawn: Indices, shown: Indices) -> None:
         """Move items (B,) to the table's centre where (B,) holds; `shown` are seen if the cue is swapped."""
-        if not bool(mask.any()):
+        if not anywhere(mask):
             return
         for index, item in enumerate(self.items):
             middle = sapien.Pose(p=[0, 0, item.shape.rest_height_m])
             self._show_item(index, middle, moved=mask & (drawn == index), seen=mask & (shown == index))
 
-    def _show_item(self, index: int, pose: sapien.Pose, *, moved: torch.Tensor, seen: torch.Tensor) -> None:
+    def _show_item(self, index: int, pose: sapien.Pose, *, moved: Flags, seen: Flags) -> None:
         """Move an item where `moved` (B,) holds, so that it is seen where `seen` (B,) holds."""
         self.move(self.candidates[index], moved if self._hides_items else seen, pose)
         if self._hides_items:
@@ -155,9 +155,9 @@ class ItemChoiceEnv(ChoiceEnv):
         highest = max(item.shape.rest_height_m for item in self.items)
         return CueSize(half_width_m=max(WIDEST_HALF_M, highest), height_m=2 * highest)
 
-    def _set_visible(self, mask: torch.Tensor, visible: bool) -> None:
+    def _set_visible(self, mask: Flags, visible: bool) -> None:
         """Let the items be seen or not, if decoys show the cue: on the CPU simulator alone."""
-        if not self._hides_items or not bool(mask.any()):
+        if not self._hides_items or not mask.any():
             return
         for actor in self.candidates:
             for entity in actor._objs:
@@ -165,9 +165,9 @@ class ItemChoiceEnv(ChoiceEnv):
                 if body is not None:  # without a renderer there is none
                     body.visibility = float(visible)
 
-    def _reveal_all(self, mask: torch.Tensor) -> None:
+    def _reveal_all(self, mask: Flags) -> None:
         self._set_visible(mask, True)
-        self.reveal(mask, torch.tensor(UPRIGHT_WXYZ, device=self.device))
+        self.reveal(mask, UPRIGHT_WXYZ)
 
 
 def check_count(name: str, count: Any, most: int, what: str, *, least: int = 2) -> None:

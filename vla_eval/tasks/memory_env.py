@@ -6,8 +6,12 @@ Differences from the official code that concern every task (reasons in `docs/tas
   `evaluate()` only reads. Hidden objects are parked on the floor, `PARK_X_M` away, beyond the far
   plane of every camera: never seen, never touched, at rest.
 - All randomness comes from `streams.generator(seed, purpose)` of the single episode.
+
+What a task knows of its episodes is numpy, (B, …) for B parallel environments: for one arm, torch takes most
+of a control step. Tensors are made only for those who step ManiSkill's environment itself (`get_info`).
 """
 
+import functools
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -21,15 +25,17 @@ from mani_skill.utils import sapien_utils
 from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError, unknown_name
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
 from vla_eval.tasks.arm import fetch, robots  # noqa: F401  importing them registers the arms
-from vla_eval.tasks.arm.arm_control import ArmControl
 from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS, Arm
+from vla_eval.tasks.arm.robots import ParsedArms, kept_loader
 from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, checked_image_size, step_range
-from vla_eval.tasks.objects.bodies import Body, to_vector
+from vla_eval.tasks.objects.bodies import Body, Flags, Indices, Steps, anywhere, velocity_of
+from vla_eval.tasks.tensors_out import Info, TensorsOut
 
 QPOS_NOISE_RAD = 0.02
 FLOOR_Z_M = -0.9196429  # the height of ManiSkill's table
@@ -40,6 +46,8 @@ CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single en
 
 Place = tuple[float, float, float]
 """x, y, z in m, world frame."""
+Wxyz = tuple[float, float, float, float]
+"""A rotation."""
 
 
 class CueSize(NamedTuple):
@@ -49,7 +57,7 @@ class CueSize(NamedTuple):
     height_m: float
 
 
-class MemoryTableEnv(ArmControl):
+class MemoryTableEnv(TensorsOut):
     """A Panda with a wrist camera at a table, with the phases cue, delay and response.
 
     Action space: ManiSkill's, by `control_mode`; the harness uses `pd_ee_delta_pose`.
@@ -119,6 +127,7 @@ class MemoryTableEnv(ArmControl):
         self.arm: Arm = ARMS[robot_uids]
         if static_threshold_rad_s <= 0:
             raise TaskArgumentError(f"static_threshold_rad_s={static_threshold_rad_s}: expected > 0.")
+        self._parsed_arms: ParsedArms = {}
         # Without it an unseeded reset would repeat the last episode: ManiSkill then keeps the old seed.
         kwargs.setdefault("enhanced_determinism", True)
         if reconfiguration_freq is None:
@@ -168,14 +177,20 @@ class MemoryTableEnv(ArmControl):
         del kept
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        self.scene.create_urdf_loader = functools.partial(kept_loader, self.scene, self._parsed_arms)
         super()._load_agent(options, sapien.Pose(p=self.arm.base_m))
+
+    def close(self) -> None:
+        """Release the simulator, and with it the renderer: what is kept of the arm has materials."""
+        self._parsed_arms.clear()
+        super().close()
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         self.table_scene = TableSceneBuilder(env=self, robot_init_qpos_noise=QPOS_NOISE_RAD)
         self.table_scene.build()
         self._park_index: dict[str, int] = {}
-        self._response_step = torch.zeros(self.num_envs, dtype=torch.int32, device=self.device)
-        self._cue_end_step = torch.zeros_like(self._response_step)
+        self._response_step: Steps = np.zeros(self.num_envs, dtype=np.int32)
+        self._cue_end_step = np.zeros_like(self._response_step)
         self._load_items()
 
     def _load_items(self) -> None:
@@ -204,16 +219,16 @@ class MemoryTableEnv(ArmControl):
         self.agent.robot.set_pose(sapien.Pose(arm.base_m))
         for env in env_idx.tolist():
             self._sample_episode(env)
-        mask = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        mask[env_idx] = True
+        mask = np.zeros(self.num_envs, dtype=np.bool_)
+        mask[env_idx.cpu().numpy()] = True
         self._on_episode_start(mask)
-        self._on_phase_edges(torch.zeros_like(self._elapsed_steps), mask)
+        self._on_phase_edges(np.zeros_like(self._response_step), mask)
 
     def _sample_episode(self, env: int) -> None:
         """Draw all random values of one episode, from `episode_generator` alone."""
         raise NotImplementedError
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
+    def _on_episode_start(self, mask: Flags) -> None:
         """Place all objects as before the first phase, and reset the latches, where `mask` holds."""
         raise NotImplementedError
 
@@ -239,11 +254,12 @@ class MemoryTableEnv(ArmControl):
         """Return the most steps that cue and delay can take together."""
         return self.total_cue_steps(self.cue_steps_range[1]) + self.delay_steps_range[1]
 
-    def phase_index(self, step: torch.Tensor) -> torch.Tensor:
+    def phase_index(self, step: Steps) -> Indices:
         """Return (B,) indices into `PHASES` for observations after `step` control steps."""
-        return (step >= self._cue_end_step).long() + (step >= self._response_step).long()
+        index: Indices = (step >= self._cue_end_step).astype(np.int64) + (step >= self._response_step)
+        return index
 
-    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+    def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         """Hide and reveal objects where a phase begins at `step`; no other method does.
 
         Returns:
@@ -251,42 +267,45 @@ class MemoryTableEnv(ArmControl):
         """
         raise NotImplementedError
 
-    def _update_latches(self, step: torch.Tensor) -> None:
+    def _update_latches(self, step: Steps) -> None:
         """Record what happened in this control step and is needed later."""
 
     def _after_control_step(self) -> None:
         if self.gpu_sim_enabled:
             self.scene._gpu_fetch_all()
-        step = self._elapsed_steps + 1  # ManiSkill counts only after this hook
-        moved = self._on_phase_edges(step, torch.ones_like(self.scene._reset_mask))
+        step = self.step_count() + 1  # ManiSkill counts only after this hook
+        moved = self._on_phase_edges(step, np.ones_like(step, dtype=np.bool_))
         if moved and self.gpu_sim_enabled:
             self.scene._gpu_apply_all()
             self.scene._gpu_fetch_all()
         self._update_latches(step)
 
     @contextmanager
-    def _only(self, mask: torch.Tensor) -> Iterator[None]:
+    def _only(self, mask: Flags) -> Iterator[None]:
         """Let setters of actors write only where `mask` holds: ManiSkill writes by `scene._reset_mask`."""
         previous = self.scene._reset_mask
-        self.scene._reset_mask = mask
+        self.scene._reset_mask = torch.as_tensor(mask, device=self.device)
         try:
             yield
         finally:
             self.scene._reset_mask = previous
 
-    def move(self, actor: Actor, mask: torch.Tensor, poses: Pose | sapien.Pose) -> None:
+    def move(self, actor: Actor, mask: Flags, poses: FloatArray | sapien.Pose) -> None:
         """Move an actor, at rest, to a pose in the environments of the mask.
 
         Args:
             actor: dynamic or kinematic.
             mask: (B,) bool.
-            poses: (B,) poses, of which the rows of the mask are used, or one pose for all; world frame.
+            poses: (B, 7) positions and rotations (wxyz), of which the rows of the mask are used, or one pose
+                for all; world frame.
         """
-        if not bool(mask.any()):
+        if not anywhere(mask):
             return
-        chosen = poses if isinstance(poses, sapien.Pose) else Pose.create(poses.raw_pose[mask])
         with self._only(mask):
-            actor.set_pose(chosen)
+            if isinstance(poses, sapien.Pose):
+                actor.set_pose(poses)
+            else:
+                actor.set_pose(Pose.create(torch.as_tensor(poses[mask], device=self.device)))
             if actor.px_body_type == "dynamic":
                 zero = torch.zeros(3, device=self.device)
                 actor.set_linear_velocity(zero)
@@ -294,12 +313,12 @@ class MemoryTableEnv(ArmControl):
 
     # ---------------------------------------------------------------- reading
 
-    def response_begun(self) -> torch.Tensor:
+    def response_begun(self) -> Flags:
         """Return (B,) bool: the response phase has begun."""
-        begun: torch.Tensor = self._elapsed_steps >= self._response_step
+        begun: Flags = self.step_count() >= self._response_step
         return begun
 
-    def gated(self, success: torch.Tensor) -> torch.Tensor:
+    def gated(self, success: Flags) -> Flags:
         """Return success where it counts: in the response phase, or always without the gate."""
         if not self.phase_gate_success:
             return success
@@ -321,17 +340,17 @@ class MemoryTableEnv(ArmControl):
         """Return a size that no object that is shown exceeds."""
         raise NotImplementedError
 
-    def status(self, info: dict[str, Any], env: int) -> TaskStatus:
-        """Return the status of one environment's episode; `info` is that of the present step."""
+    def status(self, info: Info, env: int) -> TaskStatus:
+        """Return the status of one environment's episode; `info` is `read_info()` of the present step."""
         return TaskStatus(phase=PHASES[int(info["phase"][env])], success=bool(info["success"][env]))
 
-    def true_state(self, info: dict[str, Any], env: int) -> PrivilegedState:
+    def true_state(self, info: Info, env: int) -> PrivilegedState:
         """Return what scripted controls see of one environment's episode; `info` as for `status`."""
         return PrivilegedState(
             phase=PHASES[int(info["phase"][env])],
             response_step=int(self._response_step[env]),
-            tcp_position_m=to_vector(self.agent.tcp.pose.p[env]),
-            tcp_velocity_m_s=to_vector(self.agent.tcp.linear_velocity[env]),
+            tcp_position_m=self.tcp_position_m()[env].astype(np.float64),
+            tcp_velocity_m_s=velocity_of(self.agent.tcp)[env].astype(np.float64),
             gripper_width_m=float(self.gripper_width_m()[env]),
             candidate_positions_m=np.zeros((0, 3)),
             target=None,
@@ -339,59 +358,39 @@ class MemoryTableEnv(ArmControl):
             tcp_yaw_rad=float(self.tcp_yaw_rad()[env]),
         )
 
-    def prompt(self) -> torch.Tensor:
-        """Return the (B, D) numbers that come with each observation, as `PROMPT_DIMS` names them."""
+    def evaluate(self) -> Info:
+        """Read success, failure and what they depend on; changes nothing."""
         raise NotImplementedError
 
-    def oracle_info(self) -> torch.Tensor:
-        """Return what only an oracle may know, (B, …)."""
-        raise NotImplementedError
-
-    def get_info(self) -> dict[str, Any]:
-        """Return the info of the present step; every tensor in it is a new one."""
-        info = {"elapsed_steps": self._elapsed_steps.clone(), **self.evaluate()}
-        info["phase"] = self.phase_index(self._elapsed_steps)
-        info["cue_steps"] = self._cue_end_step.clone()
-        info["delay_steps"] = self._response_step - self._cue_end_step
-        info["oracle_info"] = self.oracle_info().clone()
-        if self.PROMPT_DIMS:
-            info["task_cue"] = self.prompt().clone()
-        if self.instruction is not None:
-            info["language_instruction"] = [self.instruction] * self.num_envs
-        return info
-
-    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        extra = {"tcp_pose": self.agent.tcp.pose.raw_pose}
-        if self.obs_mode_struct.use_state:
-            extra.update(self._privileged_extra())
-        elif self.PROMPT_DIMS:
-            extra["task_cue"] = self.prompt()
-        return extra
-
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
-        """Return the task's entries of the state observation; never part of a visual observation."""
-        raise NotImplementedError
+    def read_info(self) -> Info:
+        """Return the info of the present step, (B, …) arrays by name; every array in it is a new one."""
+        steps = self.step_count()
+        return {
+            "elapsed_steps": steps.copy(),
+            **self.evaluate(),
+            "phase": self.phase_index(steps),
+        }
 
     # ---------------------------------------------------------------- reward
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
-        """Return the (B,) summands of the dense reward where the episode is not solved."""
-        raise NotImplementedError
-
-    def compute_dense_reward(self, obs: Any, action: torch.Tensor, info: dict[str, Any]) -> torch.Tensor:
+    def dense_reward(self, terms: Info, info: Info) -> FloatArray:
         """Return the (B,) sum of the terms, or `MAX_REWARD` where the success rule holds."""
-        terms = self.reward_terms(info)
-        info["reward_dict"] = terms
-        total = torch.stack([term.float() for term in terms.values()]).sum(dim=0)
-        return torch.where(info["success"], torch.full_like(total, self.MAX_REWARD), total)
+        total = sum(term.astype(np.float32) for term in terms.values())
+        reward: FloatArray = np.where(info["success"], np.float32(self.MAX_REWARD), total)
+        return reward
 
-    def compute_normalized_dense_reward(
-        self, obs: Any, action: torch.Tensor, info: dict[str, Any]
-    ) -> torch.Tensor:
-        """Return the dense reward divided by its value at success."""
-        return self.compute_dense_reward(obs, action, info) / self.MAX_REWARD
+    def normalized_reward(self, info: Info) -> FloatArray:
+        """Return the (B,) dense reward of the present step, divided by its value at success."""
+        return self.dense_reward(self.reward_terms(info), info) / np.float32(self.MAX_REWARD)
 
 
-def nearness(scale_per_m: float, distance_m: torch.Tensor) -> torch.Tensor:
+def poses(positions_m: FloatArray, wxyz: FloatArray | Wxyz = (1.0, 0.0, 0.0, 0.0)) -> FloatArray:
+    """Return (B, 7) poses of (B, 3) positions, with one rotation for all or (B, 4)."""
+    turned = np.broadcast_to(np.asarray(wxyz, dtype=np.float32), (len(positions_m), 4))
+    return np.concatenate((positions_m, turned), axis=1)
+
+
+def nearness(scale_per_m: float, distance_m: FloatArray) -> FloatArray:
     """Return `1 - tanh(scale * distance)`, the official code's shaping: 1 at no distance, 0 far away."""
-    return 1 - torch.tanh(scale_per_m * distance_m)
+    near: FloatArray = 1 - np.tanh(scale_per_m * distance_m)
+    return near

@@ -7,15 +7,17 @@ the phases are the same.
 from typing import Any
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
 from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
 from vla_eval.tasks.objects.layout import Plane, jittered_apart, slot_centres_m
+from vla_eval.tasks.tensors_out import Info
 
 SHAPE_COLOR = COLORS[2]  # blue, as in the official RememberShape
 MIXED_SHAPES = ("cube", "sphere", "t_shape", "cross", "torus")
@@ -56,7 +58,7 @@ class RememberEnv(ItemChoiceEnv):
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         super()._load_scene(options)
-        self._drawn = torch.zeros_like(self._target)
+        self._drawn = np.zeros_like(self._target)
 
     def _sample_episode(self, env: int) -> None:
         self._drawn[env] = int(self.episode_generator(env, Stream.TARGET).integers(self.n_items))
@@ -68,7 +70,7 @@ class RememberEnv(ItemChoiceEnv):
         """Return how many other items could be shown."""
         return self.n_items - 1
 
-    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+    def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         cue_begins = mask & (step == self.cue_after_steps) & (self._cue_end_step > step) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
@@ -76,20 +78,20 @@ class RememberEnv(ItemChoiceEnv):
         self._park_all(cue_ends)
         distracts = self._distract(step, mask)
         self._reveal_all(choice_begins)
-        return bool((cue_begins | cue_ends | distracts | choice_begins).any())
+        return anywhere(cue_begins | cue_ends | distracts | choice_begins)
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """As in `ChoiceEnv`, but slowing down is rewarded everywhere (official code)."""
         terms = super().reward_terms(info)
         terms["slowing"] = self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed())
         return terms
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+    def _privileged_extra(self) -> Info:
         positions = self.candidate_positions_m()
-        extra = {"oracle_info": self.oracle_info()}
+        extra: Info = {"oracle_info": self.oracle_info()}
         for index in range(self.n_items):
             is_target = (self._target == index)[:, None]
-            extra[f"goal_{index}_pose"] = torch.where(is_target, positions[:, index], 0.0)
+            extra[f"goal_{index}_pose"] = np.where(is_target, positions[:, index], np.float32(0))
         return extra
 
 
@@ -157,7 +159,7 @@ class RememberShapeAndColorEnv(RememberEnv):
     def _places_m(self, rng: np.random.Generator) -> Plane:
         return jittered_apart(slot_centres_m(self.n_items), rng)
 
-    def oracle_info(self) -> torch.Tensor:
-        """Return (B, 2) uint8: the right shape's and the right colour's number."""
+    def oracle_info(self) -> NDArray[np.uint8]:
+        """Return (B, 2): the right shape's and the right colour's number."""
         shape, color = self._target // self.n_colors, self._target % self.n_colors
-        return torch.stack([shape, color], dim=1).to(torch.uint8)
+        return np.stack((shape, color), axis=1).astype(np.uint8)

@@ -8,12 +8,25 @@ from typing import Any
 import numpy as np
 import sapien
 import torch
-from mani_skill.utils.structs import Pose
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.task_state import TaskStatus
-from vla_eval.tasks.objects.bodies import Body, moving_body, resting_body, wrapped_rad, yaw_rad
+from vla_eval.tasks.memory_env import poses
+from vla_eval.tasks.objects.bodies import (
+    Body,
+    Flags,
+    length,
+    moving_body,
+    pose_of,
+    position_of,
+    resting_body,
+    velocity_of,
+    wrapped_rad,
+    yaw_rad,
+)
+from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
 
 PEG_RANGE_M = 0.1  # the peg's centre is within ± this in x and y
@@ -106,15 +119,15 @@ class RotateEnv(WithoutCueEnv):
             builder.add_box_visual(half_size=half_sizes, material=material)
         builder.initial_pose = sapien.Pose(p=[0, 0, half_sizes[2]])
         self.peg = builder.build(name="peg")
-        self._first_position = torch.zeros(self.num_envs, 3, device=self.device)
-        self._first_yaw = torch.zeros(self.num_envs, device=self.device)
-        self._target_angle = torch.zeros(self.num_envs, device=self.device)
+        self._first_position: FloatArray = np.zeros((self.num_envs, 3), dtype=np.float32)
+        self._first_yaw: FloatArray = np.zeros(self.num_envs, dtype=np.float32)
+        self._target_angle = np.zeros_like(self._first_yaw)
 
     def _sample_episode(self, env: int) -> None:
         layout = self.episode_generator(env, Stream.LAYOUT)
         x, y = layout.uniform(-PEG_RANGE_M, PEG_RANGE_M, 2)
-        self._first_position[env] = torch.tensor((x, y, self.peg_half_sizes_m[2]))
-        self._first_yaw[env] = float(wrapped_rad(torch.tensor(layout.uniform(0, 2 * math.pi))))
+        self._first_position[env] = (x, y, self.peg_half_sizes_m[2])
+        self._first_yaw[env] = wrapped_rad(np.array(layout.uniform(0, 2 * math.pi), dtype=np.float32))
         self._target_angle[env] = self._draw_angle_rad(self.episode_generator(env, Stream.TARGET))
 
     def _draw_angle_rad(self, rng: np.random.Generator) -> float:
@@ -141,93 +154,95 @@ class RotateEnv(WithoutCueEnv):
             return int(most <= math.pi - self.angle_threshold_rad)
         return int((most - least) / 2 >= 2 * self.angle_threshold_rad)
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
-        zero = torch.zeros_like(self._first_yaw)
-        half = self._first_yaw / 2
-        turned = torch.stack([half.cos(), zero, zero, half.sin()], dim=1)
-        self.move(self.peg, mask, Pose.create_from_pq(self._first_position, turned))
+    def _on_episode_start(self, mask: Flags) -> None:
+        half = torch.from_numpy(self._first_yaw / 2)  # torch's cosine: numpy's differs in the last bit
+        zero = np.zeros_like(self._first_yaw)
+        turned = np.stack((half.cos().numpy(), zero, zero, half.sin().numpy()), axis=1)
+        self.move(self.peg, mask, poses(self._first_position, turned))
 
-    def prompt(self) -> torch.Tensor:
+    def prompt(self) -> FloatArray:
         """Return (B, 1): the angle to turn the peg by, rad, counterclockwise seen from above."""
         return self._target_angle[:, None]
 
-    def _turned_rad(self) -> torch.Tensor:
-        return wrapped_rad(yaw_rad(self.peg.pose.q) - self._first_yaw)
+    def _turned_rad(self) -> FloatArray:
+        return wrapped_rad(yaw_rad(pose_of(self.peg)[:, 3:]) - self._first_yaw)
 
-    def _remaining_rad(self) -> torch.Tensor:
-        return wrapped_rad(self._target_angle - self._turned_rad())
-
-    def _shift_m(self) -> torch.Tensor:
-        shift: torch.Tensor = (self.peg.pose.p - self._first_position)[:, :2].abs()
+    def _shift_m(self) -> FloatArray:
+        shift: FloatArray = np.abs((position_of(self.peg) - self._first_position)[:, :2])
         return shift
 
-    def _is_in_place(self) -> torch.Tensor:
+    def _is_in_place(self) -> Flags:
         if self.position_threshold_m is None:
-            return torch.ones_like(self._first_yaw, dtype=torch.bool)
-        return (self._shift_m() < self.position_threshold_m).all(dim=1)
+            return np.ones(self.num_envs, dtype=np.bool_)
+        shift_m = self._shift_m()
+        in_place: Flags = np.maximum(shift_m[:, 0], shift_m[:, 1]) < self.position_threshold_m
+        return in_place
 
-    def _is_level(self) -> torch.Tensor:
+    def _is_level(self) -> Flags:
         if self.tilt_threshold_rad is None:
-            return torch.ones_like(self._first_yaw, dtype=torch.bool)
-        upwards: torch.Tensor = self.peg.pose.to_transformation_matrix()[:, 2, 2]  # of the peg's top
-        return upwards > math.cos(self.tilt_threshold_rad)
+            return np.ones(self.num_envs, dtype=np.bool_)
+        w, x, y, z = pose_of(self.peg)[:, 3:].T
+        upwards = 1 - 2 * (x * x + y * y) / (w * w + x * x + y * y + z * z)  # of the peg's top
+        level: Flags = upwards > math.cos(self.tilt_threshold_rad)
+        return level
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def evaluate(self) -> Info:
         """Read success: turned by the target angle, in place, level, arm at rest; changes nothing."""
-        remaining, static = self._remaining_rad(), self.is_static()
-        at_angle = remaining.abs() < self.angle_threshold_rad
+        turned, static = self._turned_rad(), self.is_static()
+        error = np.abs(wrapped_rad(self._target_angle - turned))
+        at_angle = error < self.angle_threshold_rad
         shift = self._shift_m()
         return {
             "success": at_angle & self._is_in_place() & self._is_level() & static,
             "is_robot_static": static,
-            "relative_angle": self._turned_rad(),
-            "y_angle_error": remaining.abs(),
+            "relative_angle": turned,
+            "y_angle_error": error,
             "x_pos_error": shift[:, 0],
             "y_pos_error": shift[:, 1],
         }
 
-    def status(self, info: dict[str, Any], env: int) -> TaskStatus:
+    def status(self, info: Info, env: int) -> TaskStatus:
         """Return the status, with how far the peg is turned."""
         return replace(super().status(info, env), turned_rad=float(info["relative_angle"][env]))
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `peg`, and `goal`: its first position and the target yaw."""
-        peg = self.peg.pose
+        peg = pose_of(self.peg)
         goal_yaw = wrapped_rad(self._first_yaw + self._target_angle)
         return {
-            "peg": moving_body(peg.p, self.peg.linear_velocity, yaw_rad(peg.q)),
+            "peg": moving_body(peg[:, :3], velocity_of(self.peg), yaw_rad(peg[:, 3:])),
             "goal": resting_body(self._first_position, goal_yaw),
         }
 
-    def oracle_info(self) -> torch.Tensor:
+    def oracle_info(self) -> FloatArray:
         """Return (B,): the remaining angle, rad."""
-        return self._remaining_rad()
+        return wrapped_rad(self._target_angle - self._turned_rad())
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Reach the peg's centre, keep the peg in place if that matters, turn it, rest."""
-        distance = torch.linalg.norm(self.peg.pose.p - self.tcp_position_m(), dim=1)
+        distance = length(position_of(self.peg) - self.tcp_position_m())
         error = info["y_angle_error"]
         at_angle = error < self.angle_threshold_rad
         resting = at_angle & info["is_robot_static"]
         if self.position_threshold_m is None:
             return {
-                "reaching": torch.exp(-5 * distance),
-                "turning": 15 * torch.exp(-1.5 * error) * (distance < LENIENT_REACH_M),
+                "reaching": np.exp(-5 * distance),
+                "turning": 15 * np.exp(-1.5 * error) * (distance < LENIENT_REACH_M),
                 "at_angle": 5.0 * at_angle,
                 "resting": 2.0 * resting,
             }
         near = distance < STRICT_REACH_M
         near_and_placed = near & self._is_in_place()
         return {
-            "reaching": 0.5 * torch.exp(-3 * distance),
-            "placing": 5 * torch.exp(-5 * self._shift_m()).sum(dim=1) * near,
-            "turning": 35 * torch.exp(-error) * near_and_placed,
+            "reaching": 0.5 * np.exp(-3 * distance),
+            "placing": 5 * np.exp(-5 * self._shift_m()).sum(axis=1) * near,
+            "turning": 35 * np.exp(-error) * near_and_placed,
             "at_angle": 10.0 * (at_angle & near_and_placed),
             "resting": 5.0 * (resting & near_and_placed),
         }
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
-        return {"oracle_info": self.oracle_info(), "peg_pose": self.peg.pose.raw_pose}
+    def _privileged_extra(self) -> Info:
+        return {"oracle_info": self.oracle_info(), "peg_pose": pose_of(self.peg)}
 
 
 def _in_order(value: Any, *, least_rad: float) -> tuple[float, float]:

@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 import sapien
-import torch
 from numpy.typing import NDArray
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
 from vla_eval.tasks.memory_env import Place, nearness
+from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
 from vla_eval.tasks.spec import chance_of_several, total_cue_steps
+from vla_eval.tasks.tensors_out import Info
 
 TOUCH_ABOVE_TOP_M = 0.005  # the point to touch: official 2.5 cm over the centre of a cube of 4 cm
 TOUCH_RADIUS_M = 0.02
@@ -135,13 +137,13 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     def _load_scene(self, options: dict[str, Any]) -> None:
         super()._load_scene(options)
-        self._sequence = torch.zeros(self.num_envs, self.n_shown, dtype=torch.long, device=self.device)
-        self._drawn_sequence = torch.zeros_like(self._sequence)
-        self._seen_sequence = torch.zeros_like(self._sequence)
-        self._is_shown = torch.zeros_like(self._touch_rank, dtype=torch.bool)
-        self._is_drawn = torch.zeros_like(self._is_shown)
-        self._near = torch.full_like(self._target, -1)
-        self._near_steps = torch.zeros_like(self._target)
+        self._sequence: Indices = np.zeros((self.num_envs, self.n_shown), dtype=np.int64)
+        self._drawn_sequence = np.zeros_like(self._sequence)
+        self._seen_sequence = np.zeros_like(self._sequence)
+        self._is_shown: Flags = np.zeros_like(self._touch_rank, dtype=np.bool_)
+        self._is_drawn = np.zeros_like(self._is_shown)
+        self._near = np.full_like(self._target, -1)
+        self._near_steps = np.zeros_like(self._target)
 
     def _sample_episode(self, env: int) -> None:
         drawn = self.episode_generator(env, Stream.TARGET).permutation(self.n_items)
@@ -149,9 +151,9 @@ class SeveralColorsEnv(ItemChoiceEnv):
         if self.swap_cue:
             shown[0] = drawn[self.n_shown + self.swap_cue - 1]
         shown[[0, self.swap_order]] = shown[[self.swap_order, 0]]
-        self._drawn_sequence[env] = torch.as_tensor(drawn[: self.n_shown])
-        self._sequence[env] = torch.as_tensor(shown)
-        self._seen_sequence[env] = torch.as_tensor(self._shuffled(env, shown) if self.shuffle_cue else shown)
+        self._drawn_sequence[env] = drawn[: self.n_shown]
+        self._sequence[env] = shown
+        self._seen_sequence[env] = self._shuffled(env, shown) if self.shuffle_cue else shown
         for flags, sequence in ((self._is_drawn, self._drawn_sequence), (self._is_shown, self._sequence)):
             flags[env] = False
             flags[env, sequence[env]] = True
@@ -174,11 +176,11 @@ class SeveralColorsEnv(ItemChoiceEnv):
         """Return how many cubes that are not shown could be shown instead of the first one."""
         return self.n_items - self.n_shown
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
+    def _on_episode_start(self, mask: Flags) -> None:
         super()._on_episode_start(mask)
         self._near_steps[mask] = 0
 
-    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+    def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         in_cue = mask & (step < self._cue_end_step) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
@@ -190,7 +192,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         self._park_all(cue_ends)
         distracts = self._distract(step, mask)
         self._reveal_all(choice_begins)
-        return bool((moved | cue_ends | distracts | choice_begins).any())
+        return anywhere(moved | cue_ends | distracts | choice_begins)
 
     def cue_places_m(self, env: int) -> list[Place]:
         """Return where cubes are shown: in turn at the same place, or each at its own."""
@@ -198,8 +200,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
             return super().cue_places_m(env)
         return [(*bunch_place_m(index, self.n_items), 0.0) for index in self.right_candidates(env)]
 
-    def _show_together(self, mask: torch.Tensor) -> None:
-        if not bool(mask.any()):
+    def _show_together(self, mask: Flags) -> None:
+        if not anywhere(mask):
             return
         for index, item in enumerate(self.items):
             x, y = bunch_place_m(index, self.n_items)
@@ -207,25 +209,25 @@ class SeveralColorsEnv(ItemChoiceEnv):
             moved, seen = mask & self._is_drawn[:, index], mask & self._is_shown[:, index]
             self._show_item(index, place, moved=moved, seen=seen)
 
-    def _show_in_turn(self, step: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+    def _show_in_turn(self, step: Steps, mask: Flags) -> Flags:
         """Show or hide the cube whose turn begins or ends at `step`; return (B,) where anything moved."""
         step = step - self.cue_after_steps
         mask = mask & (step >= 0)
         turn_steps = self._turn_steps()
-        turn = torch.div(step, turn_steps.clamp(min=1), rounding_mode="floor").clamp(0, self.n_shown - 1)
+        turn = (step // np.maximum(turn_steps, 1)).clip(0, self.n_shown - 1)
         since = step - turn * turn_steps
         begins = mask & (since == 0)
         ends = mask & (since == turn_steps - self.gap_steps)
         self._park_all((begins & (step > 0)) | ends)
-        drawn = self._drawn_sequence.gather(1, turn.long()[:, None])[:, 0]
-        seen = self._seen_sequence.gather(1, turn.long()[:, None])[:, 0]
+        drawn, seen = (order[self._rows, turn] for order in (self._drawn_sequence, self._seen_sequence))
         self._show_in_middle(begins, drawn, seen)
-        return begins | ends
+        either: Flags = begins | ends
+        return either
 
-    def _turn_steps(self) -> torch.Tensor:
+    def _turn_steps(self) -> Steps:
         """Return (B,) the steps from one cube to the next: `total_cue_steps` solved for them."""
         cue_steps = self._cue_end_step - self.cue_after_steps
-        steps: torch.Tensor = (cue_steps + self.gap_steps) // self.n_shown
+        steps: Steps = (cue_steps + self.gap_steps) // self.n_shown
         return steps
 
     def shown_candidates(self, env: int) -> tuple[int, ...]:
@@ -234,15 +236,12 @@ class SeveralColorsEnv(ItemChoiceEnv):
         if not shown or not self.ONE_BY_ONE:
             return shown
         turn_steps = int(self._turn_steps()[env])
-        turn, since = divmod(int(self._elapsed_steps[env]) - self.cue_after_steps, turn_steps)
+        turn, since = divmod(int(self.step_count()[env]) - self.cue_after_steps, turn_steps)
         return (int(self._seen_sequence[env, turn]),) if since < turn_steps - self.gap_steps else ()
-
-    def _of_sequence(self, position: torch.Tensor) -> torch.Tensor:
-        return self._sequence.gather(1, position[:, None])[:, 0]
 
     # ---------------------------------------------------------------- touches
 
-    def touch_points_m(self) -> torch.Tensor:
+    def touch_points_m(self) -> FloatArray:
         """Return (B, N, 3): half a centimetre over the tops of the cubes, world frame."""
         points = self.candidate_positions_m()
         points[:, :, 2] += self._touch_height_m
@@ -252,65 +251,67 @@ class SeveralColorsEnv(ItemChoiceEnv):
         """Return the cubes that were shown, in the order shown."""
         return tuple(int(i) for i in self._sequence[env])
 
-    def _n_found(self) -> torch.Tensor:
+    def _n_found(self) -> Indices:
         """Return (B,) how many right cubes were touched."""
-        n_found: torch.Tensor = ((self._touch_rank > 0) & ~self._touched_wrongly).sum(dim=1)
+        n_found: Indices = ((self._touch_rank > 0) & ~self._touched_wrongly).sum(axis=1)
         return n_found
 
-    def target_index(self) -> torch.Tensor:
+    def target_index(self) -> Indices:
         """Return (B,) the cube to touch next; if any order is allowed, the first by colour (official)."""
         if self.in_order:
-            return self._of_sequence(self._n_found().clamp(max=self.n_shown - 1))
+            following: Indices = self._sequence[self._rows, np.minimum(self._n_found(), self.n_shown - 1)]
+            return following
         left = self._is_shown & (self._touch_rank == 0)
-        first_left = left.long().argmax(dim=1)
-        return torch.where(left.any(dim=1), first_left, self._sequence[:, -1])
+        return np.where(left.any(axis=1), left.argmax(axis=1), self._sequence[:, -1])
 
-    def _is_wrong(self, candidate: torch.Tensor) -> torch.Tensor:
+    def _is_wrong(self, candidate: Indices) -> Flags:
         if self.in_order:
-            return (candidate != self.target_index()) | (self._n_found() == self.n_shown)
-        return ~self._of_candidate(self._is_shown, candidate)
+            wrong: Flags = (candidate != self.target_index()) | (self._n_found() == self.n_shown)
+        else:
+            wrong = ~self._is_shown[self._rows, candidate]
+        return wrong
 
-    def _latch_touch(self, touches: torch.Tensor, candidate: torch.Tensor) -> None:
+    def _latch_touch(self, touches: Flags, candidate: Indices) -> None:
         same = touches & (self._near_steps > 0) & (candidate == self._near)
-        self._near_steps = torch.where(same, self._near_steps + 1, touches.long())
+        self._near_steps = np.where(same, self._near_steps + 1, touches)
         self._near = candidate
         super()._latch_touch(touches & (self._near_steps >= self.dwell_steps), candidate)
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def evaluate(self) -> Info:
         """Read success, failure and choices; changes nothing."""
-        static = self.is_static()
-        n_wrong = self._touched_wrongly.sum(dim=1)
-        found = self._n_found() == self.n_shown
+        reach_m, static = self.target_distance_m(), self.is_static()
+        n_wrong, n_found = self._touched_wrongly.sum(axis=1), self._n_found()
+        found = n_found == self.n_shown
         spoilt = n_wrong > 0
         return {
             "success": self.gated(found & static & ~spoilt),
-            "fail": spoilt if self.strict_choice else torch.zeros_like(spoilt),
-            "is_obj_placed": self.target_distance_m() <= self.goal_threshold_m,
+            "fail": spoilt if self.strict_choice else np.zeros_like(spoilt),
+            "is_obj_placed": reach_m <= self.goal_threshold_m,
             "is_robot_static": static,
-            "obj_to_goal_pos": self._of_target(self.touch_points_m()) - self.tcp_position_m(),
-            "first_choice": self._first_choice.clone(),
-            "n_found": self._n_found(),
+            "target_distance_m": reach_m,
+            "first_choice": self._first_choice.copy(),
+            "n_found": n_found,
             "n_wrong_choices": n_wrong,
         }
 
-    def oracle_info(self) -> torch.Tensor:
-        """Return (B, L) uint8: the cubes that were shown, in the order shown."""
-        return self._sequence.to(torch.uint8)
+    def oracle_info(self) -> NDArray[np.uint8]:
+        """Return (B, L): the cubes that were shown, in the order shown."""
+        return self._sequence.astype(np.uint8)
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Reach the next cube, slow down, find cubes, make no mistake; nothing before the response phase."""
         begun = self.response_begun()
         return {
-            "reaching": nearness(self.REACH_SCALE_PER_M, self.target_distance_m()) * begun,
+            "reaching": nearness(self.REACH_SCALE_PER_M, info["target_distance_m"]) * begun,
             "slowing": self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed()) * begun,
             "found": FOUND_REWARD * info["n_found"] / self.n_shown,
             "mistakes": MISTAKE_REWARD * info["n_wrong_choices"],
         }
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+    def _privileged_extra(self) -> Info:
         positions = self.candidate_positions_m()
         following = self.target_index()
-        extra = {
+        extra: Info = {
             "obj_to_goal_pos": self._of_target(self.touch_points_m()) - self.tcp_position_m(),
             "oracle_info": self.oracle_info(),
         }

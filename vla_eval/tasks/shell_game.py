@@ -6,17 +6,19 @@ Touching it is `ShellGameTouchEnv`; pushing and picking it are in `shell_game_mo
 import math
 from typing import Any, Literal
 
+import numpy as np
 import sapien
-import torch
 from mani_skill.utils.building import actors
-from mani_skill.utils.structs import Pose
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv
 from vla_eval.tasks.interface import StepRange
-from vla_eval.tasks.memory_env import CueSize, Place
+from vla_eval.tasks.memory_env import CueSize, Place, Wxyz, poses
 from vla_eval.tasks.objects import mug as mugs
+from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere, pose_of
+from vla_eval.tasks.tensors_out import Info
 
 N_MUGS = 3
 MUG_SPACING_M = 0.2
@@ -80,9 +82,9 @@ class ShellGameEnv(ChoiceEnv):
         pose = self.parking_pose(name, half_height_m=MUG_REST_Z_M)
         return sapien.Pose(p=pose.p, q=list(UPSIDE_DOWN_WXYZ))
 
-    def _mug_orientation_wxyz(self) -> torch.Tensor:
+    def _mug_orientation_wxyz(self) -> FloatArray | Wxyz:
         """Return the orientation of all mugs when they appear, (4,) or (B, 4)."""
-        return torch.tensor(UPSIDE_DOWN_WXYZ, device=self.device)
+        return UPSIDE_DOWN_WXYZ
 
     def _sample_episode(self, env: int) -> None:
         drawn = int(self.episode_generator(env, Stream.TARGET).integers(N_MUGS))
@@ -90,8 +92,7 @@ class ShellGameEnv(ChoiceEnv):
         layout = self.episode_generator(env, Stream.LAYOUT)
         x, y = layout.uniform(-LAYOUT_HALF_RANGE_M, LAYOUT_HALF_RANGE_M, 2)
         for index in range(N_MUGS):
-            place = (x, y + (index - 1) * MUG_SPACING_M, MUG_REST_Z_M)
-            self._slots[env, index] = torch.tensor(place, dtype=torch.float32)
+            self._slots[env, index] = (x, y + (index - 1) * MUG_SPACING_M, MUG_REST_Z_M)
 
     def cue_places_m(self, env: int) -> list[Place]:
         """Return where the ball is shown."""
@@ -106,7 +107,7 @@ class ShellGameEnv(ChoiceEnv):
         """Return at how many other places the ball could lie."""
         return N_MUGS - 1
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
+    def _on_episode_start(self, mask: Flags) -> None:
         super()._on_episode_start(mask)
         for actor in self.candidates:
             self.move(actor, mask, self._mug_parking_pose(actor.name))
@@ -115,29 +116,28 @@ class ShellGameEnv(ChoiceEnv):
         else:
             self.move(self.ball, mask, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
 
-    def _put_ball_under(self, positions: torch.Tensor, mask: torch.Tensor) -> None:
-        resting = positions.clone()
+    def _put_ball_under(self, positions: FloatArray, mask: Flags) -> None:
+        resting = positions.copy()
         resting[:, 2] = BALL_RADIUS_M
-        self.move(self.ball, mask, Pose.create_from_pq(resting))
+        self.move(self.ball, mask, poses(resting))
 
-    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+    def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         choice_begins = mask & (step == self._response_step)
         cue_begins = mask & (step == self.cue_after_steps) & (step > 0) & (step < self._cue_end_step)
         self._put_ball_under(self._of_target(self._slots), cue_begins & self.show_cue)
-        begun = self._cue_end_step if self.show_cue else torch.zeros_like(self._cue_end_step)
+        begun = self._cue_end_step if self.show_cue else np.zeros_like(self._cue_end_step)
         hidden = mask & (step >= begun) & (step < self._response_step)
         self.reveal(choice_begins, self._mug_orientation_wxyz())
         # Between cue and choice the ball is hidden; later it moves with its mug.
         self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
         covered = mask & (step >= self._response_step)
         self._put_ball_under(self._of_target(self.candidate_positions_m()), covered)
-        return bool((cue_begins | choice_begins | hidden | covered).any())
+        return anywhere(cue_begins | choice_begins | hidden | covered)
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
-        poses = torch.stack([actor.pose.raw_pose for actor in self.candidates], dim=1)
+    def _privileged_extra(self) -> Info:
         return {
-            "obj_pose": self._of_target(poses),
-            "ball_pose": self.ball.pose.raw_pose,
+            "obj_pose": self._of_target(np.stack([pose_of(actor) for actor in self.candidates], axis=1)),
+            "ball_pose": pose_of(self.ball),
             "oracle_info": self.oracle_info(),
         }
 
@@ -161,6 +161,6 @@ class ShellGameTouchEnv(ShellGameEnv):
         """Give the threshold its default."""
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """As in `ChoiceEnv`, but nothing before the mugs stand there (official code)."""
         return {name: term * self.response_begun() for name, term in super().reward_terms(info).items()}

@@ -7,12 +7,25 @@ but at most `CHOSEN_M`: a wrong mug that is pushed aside counts, one that is onl
 import math
 from typing import Any
 
-import torch
+import numpy as np
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.objects.bodies import Body, length, moving_body, resting_body, yaw_rad
+from vla_eval.tasks.memory_env import Wxyz, nearness
+from vla_eval.tasks.objects.bodies import (
+    Body,
+    Flags,
+    Steps,
+    anywhere,
+    length,
+    moving_body,
+    pose_of,
+    resting_body,
+    velocity_of,
+    yaw_rad,
+)
 from vla_eval.tasks.shell_game import BALL_RADIUS_M, N_MUGS, ShellGameEnv
+from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import check_positive
 
 CHOSEN_M = 0.02
@@ -45,17 +58,16 @@ class ShellGameMoveEnv(ShellGameEnv):
         """Return the goal relative to the ball's centre; world frame."""
         raise NotImplementedError
 
-    def goal_positions_m(self) -> torch.Tensor:
+    def goal_positions_m(self) -> FloatArray:
         """Return (B, N, 3): the goal of each mug if the ball were under it; world frame."""
-        goals = self._slots.clone()
+        goals = self._slots.copy()
         goals[:, :, 2] = BALL_RADIUS_M
-        return goals + torch.tensor(self._goal_offset_m(), device=self.device)
+        return goals + np.array(self._goal_offset_m(), dtype=np.float32)
 
-    def _target_to_goal_m(self) -> torch.Tensor:
-        offset: torch.Tensor = self._of_target(self.goal_positions_m() - self.candidate_positions_m())
-        return offset
+    def _target_to_goal_m(self) -> FloatArray:
+        return self._of_target(self.goal_positions_m() - self.candidate_positions_m())
 
-    def is_placed(self) -> torch.Tensor:
+    def is_placed(self, reach_m: FloatArray) -> Flags:
         """Return (B,) bool: the right mug is within the threshold of its goal."""
         return length(self._target_to_goal_m()) <= self.goal_threshold_m
 
@@ -63,17 +75,19 @@ class ShellGameMoveEnv(ShellGameEnv):
         """Return the distance by which a mug must have been moved to count as chosen."""
         return CHOSEN_M
 
-    def _update_latches(self, step: torch.Tensor) -> None:
-        moved_m = torch.linalg.norm(self.candidate_positions_m() - self._slots, dim=2)
-        moved_m = torch.where((step > self._response_step)[:, None], moved_m, 0.0)
+    def _update_latches(self, step: Steps) -> None:
+        begun = step > self._response_step
+        if not anywhere(begun):
+            return
+        moved_m = length(self.candidate_positions_m() - self._slots)
         # Largest movement first: it was touched first if two pass the limit in the same step.
-        for rank in range(N_MUGS):
-            farthest, index = moved_m.sort(dim=1, descending=True)
-            self._latch_touch(farthest[:, rank] >= self._chosen_m(), index[:, rank])
+        order = (-moved_m).argsort(axis=1, kind="stable")
+        for index in order.T:
+            self._latch_touch(begun & (moved_m[self._rows, index] >= self._chosen_m()), index)
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
-        """Read success, failure and choices; changes nothing."""
-        return {**super().evaluate(), "obj_to_goal_pos": self._target_to_goal_m()}
+    def extra_info(self) -> Info:
+        """Return the way of the right mug to its goal."""
+        return {"obj_to_goal_pos": self._target_to_goal_m()}
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `mug_0` … and `goal_0` …, of all mugs alike, in candidate order."""
@@ -81,12 +95,12 @@ class ShellGameMoveEnv(ShellGameEnv):
         goals = self.goal_positions_m()
         for index, actor in enumerate(self.candidates):
             bodies[f"mug_{index}"] = moving_body(
-                self.final_positions_m()[:, index], actor.linear_velocity, yaw_rad(actor.pose.q)
+                self.final_positions_m()[:, index], velocity_of(actor), yaw_rad(pose_of(actor)[:, 3:])
             )
             bodies[f"goal_{index}"] = resting_body(goals[:, index])
         return bodies
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+    def _privileged_extra(self) -> Info:
         return {"goal_pos": self._of_target(self.goal_positions_m()), **super()._privileged_extra()}
 
 
@@ -128,10 +142,10 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     def _chosen_m(self) -> float:
         return min(CHOSEN_M, self.push_distance_m - self.goal_threshold_m)
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Reach the right mug and push it, once the mugs stand there."""
-        reach_m = self.target_distance_m()
-        to_goal_m = torch.linalg.norm(self._target_to_goal_m(), dim=1)
+        reach_m = info["target_distance_m"]
+        to_goal_m = length(self._target_to_goal_m())
         terms = super().reward_terms(info)
         terms["pushing"] = 2 * nearness(5.0, to_goal_m) * (reach_m <= PUSH_REACH_M)
         return {name: term * self.response_begun() for name, term in terms.items()}
@@ -185,10 +199,10 @@ class ShellGamePickEnv(ShellGameMoveEnv):
     def _goal_offset_m(self) -> tuple[float, float, float]:
         return (0.0, 0.0, self.lift_height_m + GOAL_ABOVE_BALL_M)
 
-    def is_placed(self) -> torch.Tensor:
+    def is_placed(self, reach_m: FloatArray) -> Flags:
         """Return (B,) bool: the right mug has been lifted high enough."""
         if self.goal_is_a_point:
-            return super().is_placed()
+            return super().is_placed(reach_m)
         risen_m = self._of_target(self.candidate_positions_m() - self._slots)[:, 2]
         return self.response_begun() & (risen_m >= self.lift_height_m)
 
@@ -196,24 +210,25 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         needed_m = self.lift_height_m - (self.goal_threshold_m if self.goal_is_a_point else 0.0)
         return min(CHOSEN_M, needed_m)
 
-    def _mug_orientation_wxyz(self) -> torch.Tensor:
-        quaternions = torch.tensor([_upside_down_wxyz(turn) for turn in OFFICIAL_TURNS], device=self.device)
+    def _mug_orientation_wxyz(self) -> FloatArray | Wxyz:
+        quaternions = np.array([_upside_down_wxyz(turn) for turn in OFFICIAL_TURNS], dtype=np.float32)
         # The handles belong to the scene: with `swap_cue` they stay as they were drawn.
         drawn = (self._target - self.swap_cue) % N_MUGS
-        return quaternions[drawn] if self.official_mug_yaws else quaternions[-1]
+        turned: FloatArray = quaternions[drawn] if self.official_mug_yaws else quaternions[-1]
+        return turned
 
-    def _is_grasped(self) -> torch.Tensor:
-        grasped = torch.stack([self.agent.is_grasping(actor) for actor in self.candidates], dim=1)
+    def _is_grasped(self) -> Flags:
+        grasped = np.stack([self.grasps(actor) for actor in self.candidates], axis=1)
         return self._of_target(grasped)
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
-        """Read success, failure and choices; changes nothing."""
-        return {**super().evaluate(), "is_grasped": self._is_grasped()}
+    def extra_info(self) -> Info:
+        """Return the way of the right mug to its goal, and whether it is grasped."""
+        return {**super().extra_info(), "is_grasped": self._is_grasped()}
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Reach the right mug and lift it, once the mugs stand there."""
-        reach_m = self.target_distance_m()
-        to_goal_m = torch.linalg.norm(self._target_to_goal_m(), dim=1)
+        reach_m = info["target_distance_m"]
+        to_goal_m = length(self._target_to_goal_m())
         placed, near = info["is_obj_placed"], reach_m <= PICK_REACH_M
         terms = {
             "reaching": 3 * nearness(self.REACH_SCALE_PER_M, reach_m),
@@ -223,5 +238,5 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         }
         return {name: term * self.response_begun() for name, term in terms.items()}
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+    def _privileged_extra(self) -> Info:
         return {**super()._privileged_extra(), "is_grasped": self._is_grasped()[:, None]}

@@ -2,16 +2,28 @@
 
 from typing import Any
 
+import numpy as np
 import sapien
-import torch
 from mani_skill.utils.building import actors
-from mani_skill.utils.structs import Pose
 
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.intercept import UPWARDS_WXYZ
-from vla_eval.tasks.memory_env import nearness
-from vla_eval.tasks.objects.bodies import Body, length, moving_body, resting_body
+from vla_eval.tasks.memory_env import nearness, poses
+from vla_eval.tasks.objects.bodies import (
+    Body,
+    Flags,
+    Steps,
+    anywhere,
+    length,
+    moving_body,
+    pose_of,
+    position_of,
+    resting_body,
+    velocity_of,
+)
+from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
 
 START_X_M = (-0.05, 0.05)
@@ -91,10 +103,10 @@ class TakeItBackEnv(WithoutCueEnv):
         )
         self.red_disc = self._build_disc("goal_region", RED_RGBA)
         self.violet_disc = self._build_disc("changed_goal_region", VIOLET_RGBA)
-        self._first_place = torch.zeros(self.num_envs, 3, device=self.device)
-        self._goal_position = torch.zeros(self.num_envs, 3, device=self.device)
-        self._goal_reached = torch.zeros(self.num_envs, dtype=torch.bool, device=self.device)
-        self._is_violet = torch.zeros_like(self._goal_reached)
+        self._first_place: FloatArray = np.zeros((self.num_envs, 3), dtype=np.float32)
+        self._goal_position = np.zeros_like(self._first_place)
+        self._goal_reached: Flags = np.zeros(self.num_envs, dtype=np.bool_)
+        self._is_violet: Flags = np.zeros_like(self._goal_reached)
 
     def _build_disc(self, name: str, rgba: tuple[float, ...]) -> Any:  # an actor; ManiSkill is untyped
         builder = self.scene.create_actor_builder()
@@ -115,86 +127,85 @@ class TakeItBackEnv(WithoutCueEnv):
         drawn = int(self.episode_generator(env, Stream.TARGET).integers(len(START_BANDS_Y_M)))
         band_m = START_BANDS_Y_M[(drawn + self.swap_cue) % len(START_BANDS_Y_M)]
         x, y = layout.uniform(*START_X_M), band_m + layout.uniform(0, START_BAND_WIDTH_M)
-        self._first_place[env] = torch.tensor((x, y, self.cube_half_size_m))
-        goal_m = (layout.uniform(*GOAL_X_M), layout.uniform(*GOAL_Y_M), DISC_Z_M)
-        self._goal_position[env] = torch.tensor(goal_m)
+        self._first_place[env] = (x, y, self.cube_half_size_m)
+        self._goal_position[env] = (layout.uniform(*GOAL_X_M), layout.uniform(*GOAL_Y_M), DISC_Z_M)
 
     def n_swaps(self) -> int:
         """Return in how many other bands the cube could lie."""
         return len(START_BANDS_Y_M) - 1
 
-    def _on_episode_start(self, mask: torch.Tensor) -> None:
+    def _on_episode_start(self, mask: Flags) -> None:
         self._goal_reached[mask] = False
-        self.move(self.cube, mask, Pose.create_from_pq(self._first_place))
-        self._color_goal(mask, torch.zeros_like(mask))
+        self.move(self.cube, mask, poses(self._first_place))
+        self._color_goal(mask, np.zeros_like(mask))
 
-    def _color_goal(self, mask: torch.Tensor, violet: torch.Tensor) -> None:
+    def _color_goal(self, mask: Flags, violet: Flags) -> None:
         """Show the violet disc where `mask` and `violet` hold, the red one where only `mask` does."""
-        turned = torch.tensor(UPWARDS_WXYZ, device=self.device).expand(self.num_envs, 4)
-        at_goal = Pose.create_from_pq(self._goal_position, turned)
+        if not anywhere(mask):
+            return
+        at_goal = poses(self._goal_position, UPWARDS_WXYZ)
         for disc, shown in ((self.red_disc, mask & ~violet), (self.violet_disc, mask & violet)):
             self.move(disc, shown, at_goal)
             self.move(disc, mask & ~shown, self._parked_disc(disc.name))
-        self._is_violet = torch.where(mask, violet, self._is_violet)
+        self._is_violet[mask] = violet[mask]
 
-    def _cube_distance_m(self, place: torch.Tensor) -> torch.Tensor:
-        return length((self.cube.pose.p - place)[:, :2])
+    def _cube_distance_m(self, place: FloatArray) -> FloatArray:
+        return length((position_of(self.cube) - place)[:, :2])
 
-    def _in_goal(self) -> torch.Tensor:
+    def _in_goal(self) -> Flags:
         return self._cube_distance_m(self._goal_position) < self.goal_radius_m
 
-    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+    def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         # No phase begins, but the disc changes colour when the cube reaches it or leaves it.
         in_goal = self._in_goal()
         violet = in_goal | (self._goal_reached & self.latch_goal_color)
         changed = mask & (step > 0) & (violet != self._is_violet)
         self._color_goal(changed, violet)
-        return bool(changed.any())
+        return anywhere(changed)
 
-    def _update_latches(self, step: torch.Tensor) -> None:
+    def _update_latches(self, step: Steps) -> None:
         self._goal_reached |= self._in_goal()
 
-    def evaluate(self) -> dict[str, torch.Tensor]:
+    def evaluate(self) -> Info:
         """Read success: the goal was reached and the cube is back at this step; changes nothing."""
         is_back = self._cube_distance_m(self._first_place) < self.return_radius_m
         return {
             "success": self._goal_reached & is_back,
             "goal_achieved": self._in_goal(),
-            "goal_reached_status": self._goal_reached.clone(),
+            "goal_reached_status": self._goal_reached.copy(),
             "is_robot_static": self.is_static(),
         }
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `cube`, `goal`, `first_place` and `violet_disc`, which is below the table while red."""
         return {
-            "cube": moving_body(self.cube.pose.p, self.cube.linear_velocity),
+            "cube": moving_body(position_of(self.cube), velocity_of(self.cube)),
             "goal": resting_body(self._goal_position),
-            "violet_disc": resting_body(self.violet_disc.pose.p),
+            "violet_disc": resting_body(position_of(self.violet_disc)),
             "first_place": resting_body(self._first_place),
         }
 
-    def oracle_info(self) -> torch.Tensor:
+    def oracle_info(self) -> FloatArray:
         """Return (B, 3): where the cube's centre was at the start, m, world frame."""
         return self._first_place
 
-    def reward_terms(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+    def reward_terms(self, info: Info) -> Info:
         """Push the cube to the goal; once it was there, pull it back."""
         back = self._goal_reached
-        offset_x = torch.where(back, PULL_AHEAD_M, -PUSH_BEHIND_M)
-        contact = self.cube.pose.p.clone()
-        contact[:, 0] += offset_x
-        distance = torch.linalg.norm(contact - self.tcp_position_m(), dim=1)
-        place = torch.where(back[:, None], self._first_place, self._goal_position)
+        contact = position_of(self.cube)
+        contact[:, 0] += np.where(back, PULL_AHEAD_M, -PUSH_BEHIND_M)
+        distance = length(contact - self.tcp_position_m())
+        place = np.where(back[:, None], self._first_place, self._goal_position)
         there = distance < CONTACT_M
         return {
-            "reaching": torch.where(back, 10.0, 2.0) * nearness(5.0, distance),
-            "moving": torch.where(back, 15.0, 5.0) * nearness(5.0, self._cube_distance_m(place)) * there,
+            "reaching": np.where(back, 10.0, 2.0) * nearness(5.0, distance),
+            "moving": np.where(back, 15.0, 5.0) * nearness(5.0, self._cube_distance_m(place)) * there,
         }
 
-    def _privileged_extra(self) -> dict[str, torch.Tensor]:
+    def _privileged_extra(self) -> Info:
         return {
             "goal_pos": self._goal_position,
-            "cube_pose": self.cube.pose.raw_pose,
+            "cube_pose": pose_of(self.cube),
             "oracle_info": self.oracle_info(),
             "goal_reached_status": self._goal_reached[:, None],
         }

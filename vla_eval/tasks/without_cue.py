@@ -2,10 +2,9 @@
 
 from typing import Any
 
-import torch
-
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.memory_env import MemoryTableEnv
+from vla_eval.tasks.objects.bodies import Flags, Steps
 
 
 class WithoutCueEnv(MemoryTableEnv):
@@ -23,7 +22,7 @@ class WithoutCueEnv(MemoryTableEnv):
                 )
         super().__init__(*args, cue_steps=0, delay_steps=0, **kwargs)
 
-    def _on_phase_edges(self, step: torch.Tensor, mask: torch.Tensor) -> bool:
+    def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         return False
 
 

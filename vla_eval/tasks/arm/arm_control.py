@@ -1,6 +1,7 @@
 """The arm: where it is, how an action reaches it, and what replaces actions before the choice.
 
-Knows nothing of objects, rewards or what a task is about.
+Arrays begin here: what ManiSkill keeps as tensors is read as numpy, (B, …) float32. Knows nothing of
+objects, rewards or what a task is about.
 """
 
 from typing import Any
@@ -11,10 +12,22 @@ from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.geometry.rotation_conversions import matrix_to_euler_angles, quaternion_to_matrix
 
 from vla_eval.control_modes import ABSOLUTE_MODES, EE_DELTA_POS, EE_DELTA_POSE, EE_POSE, JOINT_POS
+from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.arm.arms import Arm
+from vla_eval.tasks.arm.drives import Drive, drives_of
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
-from vla_eval.tasks.objects.bodies import length, yaw_rad
+from vla_eval.tasks.objects.bodies import (
+    Flags,
+    Indices,
+    Steps,
+    anywhere,
+    length,
+    pose_of,
+    position_of,
+    to_array,
+    yaw_rad,
+)
 
 
 class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
@@ -26,32 +39,75 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     freeze_until_choice: bool
     move_in_delay: bool
     # (B, A) the last action as it was carried out; None after a step without one
-    executed_action: torch.Tensor | None
-    _cue_end_step: torch.Tensor
-    _response_step: torch.Tensor
+    executed_action: FloatArray | None
+    _cue_end_step: Steps
+    _response_step: Steps
 
-    def tcp_position_m(self) -> torch.Tensor:
+    def step_count(self) -> Steps:
+        """Return (B,) the control steps since the reset."""
+        steps: Steps = self._elapsed_steps.cpu().numpy()
+        return steps
+
+    def qpos(self) -> FloatArray:
+        """Return the (B, J) joint positions, rad, and m for the fingers."""
+        if self.gpu_sim_enabled:
+            return to_array(self.agent.robot.get_qpos())
+        positions: FloatArray = self.agent.robot._objs[0].qpos[None]
+        return positions
+
+    def qvel(self) -> FloatArray:
+        """Return the (B, J) joint velocities, rad/s, and m/s for the fingers."""
+        if self.gpu_sim_enabled:
+            return to_array(self.agent.robot.get_qvel())
+        velocities: FloatArray = self.agent.robot._objs[0].qvel[None]
+        return velocities
+
+    def tcp_pose(self) -> FloatArray:
+        """Return (B, 7): position and rotation (wxyz) of the tool centre point, world frame."""
+        return pose_of(self.agent.tcp)
+
+    def tcp_position_m(self) -> FloatArray:
         """Return the (B, 3) tool centre point, world frame."""
-        position: torch.Tensor = self.agent.tcp.pose.p
-        return position
+        return position_of(self.agent.tcp)
 
-    def tcp_yaw_rad(self) -> torch.Tensor:
+    def tcp_yaw_rad(self) -> FloatArray:
         """Return (B,): the gripper's yaw about world z; 0 with the fingers aligned along y."""
-        return yaw_rad(self.agent.tcp.pose.q)
+        return yaw_rad(self.tcp_pose()[:, 3:])
 
-    def gripper_width_m(self) -> torch.Tensor:
+    def gripper_width_m(self) -> FloatArray:
         """Return the (B,) gap between the fingers."""
-        width: torch.Tensor = self.agent.robot.get_qpos()[:, -2:].sum(dim=1)
+        qpos = self.qpos()
+        width: FloatArray = qpos[:, -2] + qpos[:, -1]
         return width
 
-    def is_static(self) -> torch.Tensor:
+    def arm_qvel(self) -> FloatArray:
+        """Return the (B, J) velocities of the joints that move the hand, rad/s."""
+        if self._arm_joints is None:
+            self._arm_joints = np.array(self.arm.arm_joints)
+        return self.qvel().take(self._arm_joints, axis=1)
+
+    _arm_joints: Indices | None = None
+
+    def is_static(self) -> Flags:
         """Return (B,) bool: no arm joint moves faster than the threshold."""
-        static: torch.Tensor = self.agent.is_static(self.static_threshold_rad_s)
+        fastest = np.maximum.reduce(np.abs(self.arm_qvel()), axis=1)
+        static: Flags = fastest <= self.static_threshold_rad_s
         return static
 
-    def arm_speed(self) -> torch.Tensor:
+    def arm_speed(self) -> FloatArray:
         """Return the (B,) Euclidean norm of the arm's joint velocities, rad/s."""
-        return length(self.agent.robot.get_qvel()[:, list(self.arm.arm_joints)])
+        return length(self.arm_qvel())
+
+    def grasps(self, actor: Any) -> Flags:
+        """Return (B,) bool: both fingers press an actor, with at least 0.5 N (ManiSkill's rule)."""
+        if not self.gpu_sim_enabled:
+            # Its rule takes 0.5 ms; most of the time a finger does not touch the actor at all.
+            fingers = (self.agent.finger1_link, self.agent.finger2_link)
+            forces_n = (self.scene.get_pairwise_contact_forces(finger, actor) for finger in fingers)
+            if any(not bool(force_n.any()) for force_n in forces_n):
+                return np.zeros(1, dtype=np.bool_)
+        grasped: Flags = self.agent.is_grasping(actor).cpu().numpy()
+        return grasped
 
     def check_motion(self) -> None:
         """Raise `TaskArgumentError` if the scripted motion cannot be made in this control mode."""
@@ -61,7 +117,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
                 f"{EE_DELTA_POSE} and {EE_DELTA_POS} only. Use one of these modes, or leave it out."
             )
 
-    def hold_action(self) -> torch.Tensor:
+    def hold_action(self) -> FloatArray:
         """Return the (B, A) action that moves neither arm nor fingers, with the present gripper width.
 
         In a delta mode all motions are 0; in `pd_joint_pos` it is the joints' present targets, in
@@ -70,51 +126,83 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         Raises:
             TaskArgumentError: the control mode has no action for that.
         """
-        action = torch.zeros(self.num_envs, self.single_action_space.shape[0], device=self.device)
+        action = np.zeros((self.num_envs, self.single_action_space.shape[0]), dtype=np.float32)
         arm = self.agent.controller.controllers["arm"]
         if self.control_mode == JOINT_POS:
-            action[:, :-1] = arm._target_qpos
+            action[:, :-1] = self.joint_targets()
         elif self.control_mode == EE_POSE:
             pose = arm.ee_pose_at_base
-            action[:, :3] = pose.p
-            action[:, 3:6] = matrix_to_euler_angles(quaternion_to_matrix(pose.q), "XYZ")
+            action[:, :3] = to_array(pose.p)
+            action[:, 3:6] = to_array(matrix_to_euler_angles(quaternion_to_matrix(pose.q), "XYZ"))
         elif "delta" not in self.control_mode:
             raise TaskArgumentError(
                 f"control_mode={self.control_mode!r}: no action of this mode holds the arm still."
             )
         gripper = self.agent.controller.controllers["gripper"]
         low, high = gripper.config.lower, gripper.config.upper
-        width = self.agent.robot.get_qpos()[:, -2:].mean(dim=1)
-        action[:, -1] = ((width - low) / (high - low) * 2 - 1).clamp(-1, 1)
+        width = self.gripper_width_m() / 2
+        action[:, -1] = ((width - low) / (high - low) * 2 - 1).clip(-1, 1)
         return action
+
+    def joint_targets(self) -> FloatArray:
+        """Return the (B, J) joint positions, rad, at which the arm aims since the last action."""
+        return to_array(self.agent.controller.controllers["arm"]._target_qpos)
+
+    def advance(self, actions: FloatArray) -> None:
+        """Execute one control step: `executed_action` says what was done. Reads nothing.
+
+        Args:
+            actions: (B, A) float32.
+
+        Raises:
+            ValueError: an action is not a number.
+        """
+        self._execute(actions)
+        self._elapsed_steps += 1
+
+    def _execute(self, actions: FloatArray) -> None:
+        if anywhere(np.isnan(actions)):
+            raise ValueError(f"An action is not a number: {actions.tolist()}.")
+        if self.freeze_until_choice or self.move_in_delay:
+            actions = self._replaced(actions)
+        space = self.single_action_space
+        self.executed_action = np.minimum(np.maximum(actions, space.low), space.high)
+        # ManiSkill clips only numbers that it scales.
+        driven = self.executed_action if self.control_mode in ABSOLUTE_MODES else actions
+        if self.gpu_sim_enabled:
+            super()._step_action(torch.as_tensor(driven, device=self.device))
+            return
+        for part, drive in self._drives():
+            drive(driven[0, part])
+        for _ in range(self._sim_steps_per_control):
+            self.scene.px.step()
+        self._after_control_step()
+
+    _driven: Any = None  # the controller that the drives are of; a new scene has another one
+
+    def _drives(self) -> list[tuple[slice, Drive]]:
+        if self._driven is not self.agent.controller:
+            self._driven, self._parts = self.agent.controller, drives_of(self.agent)
+        return self._parts
 
     def _step_action(self, action: Any) -> Any:
-        if (self.freeze_until_choice or self.move_in_delay) and action is not None:
-            given = torch.as_tensor(np.asarray(action, dtype=np.float32), device=self.device)
-            action = self._replaced(given.reshape(self.num_envs, -1))
-        if self.control_mode in ABSOLUTE_MODES and action is not None:
-            action = self._clipped(torch.as_tensor(action, dtype=torch.float32, device=self.device))
-        executed = super()._step_action(action)
-        self.executed_action = None if executed is None else self._clipped(executed)
-        return executed
+        if action is None or isinstance(action, dict):  # ManiSkill's other forms
+            self.executed_action = None
+            return super()._step_action(action)
+        given = to_array(action) if torch.is_tensor(action) else np.asarray(action, dtype=np.float32)
+        self._execute(given.reshape(self.num_envs, -1))
+        return torch.as_tensor(given, device=self.device)
 
-    def _clipped(self, action: torch.Tensor) -> torch.Tensor:
-        """Return the action within its bounds: ManiSkill clips only numbers that it scales."""
-        low, high = (
-            torch.as_tensor(bound, device=self.device)
-            for bound in (self.single_action_space.low, self.single_action_space.high)
-        )
-        return action.clamp(low, high)
-
-    def _replaced(self, action: torch.Tensor) -> torch.Tensor:
-        """Return the (B, A) action with what holds or moves the arm before the choice in its place."""
-        action, held = action.clone(), self.hold_action()  # not the caller's array
+    def _replaced(self, actions: FloatArray) -> FloatArray:
+        """Return the (B, A) actions with what holds or moves the arm before the choice in their place."""
+        replaced, held, steps = actions.copy(), self.hold_action(), self.step_count()
         if self.freeze_until_choice:
-            action = torch.where((self._elapsed_steps < self._response_step)[:, None], held, action)
+            frozen = steps < self._response_step
+            replaced[frozen] = held[frozen]
         for env in range(self.num_envs) if self.move_in_delay else ():
             begins, ends = int(self._cue_end_step[env]), int(self._response_step[env])
-            motion = delay_motion(int(self._elapsed_steps[env]), begins=begins, ends=ends)
+            motion = delay_motion(int(steps[env]), begins=begins, ends=ends)
             if motion is not None:
-                action[env] = torch.zeros_like(held[env])
-                action[env, Y_DIMENSION], action[env, GRIPPER_DIMENSION] = motion
-        return action
+                replaced[env] = 0
+                replaced[env, Y_DIMENSION], replaced[env, GRIPPER_DIMENSION] = motion
+        return replaced

@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import sapien
-import torch
 from gymnasium.spaces import Box
 from mani_skill.agents.controllers import PassiveController, PassiveControllerConfig
 from mani_skill.agents.registration import register_agent
@@ -13,7 +12,7 @@ from mani_skill.agents.robots.fetch import Fetch
 from mani_skill.sensors.camera import CameraConfig
 
 from vla_eval.features import IMAGE_SIZE_PX
-from vla_eval.tasks.arm.arms import FETCH, FETCH_UID
+from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.interface import CAMERA_FOV_RAD
 
 HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint with this damping does not move by itself
@@ -64,12 +63,3 @@ class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
             mode: {"arm": parts["arm"], "gripper": parts["gripper"], "still": still}
             for mode, parts in super()._controller_configs.items()
         }
-
-    def is_static(self, threshold: float = 0.2) -> torch.Tensor:
-        """Return (B,) bool: no joint of the arm is faster than the threshold.
-
-        Fetch's own rule compares signed velocities, so any negative velocity passes.
-        """
-        speeds = self.robot.get_qvel()[:, list(FETCH.arm_joints)].abs()
-        static: torch.Tensor = (speeds <= threshold).all(dim=1)
-        return static

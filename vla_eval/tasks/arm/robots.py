@@ -1,4 +1,4 @@
-"""The arm with its wrist camera, with meshes of that camera that render faster.
+"""The arm with its wrist camera, with meshes of that camera that render faster; arms that load again fast.
 
 The camera's mesh takes most of the rendering time on a CPU (`camera_mesh`). Each variant replaces it, for
 rendering only: physics and collision shapes are the same. The files are created on first use in the user's
@@ -9,11 +9,13 @@ import functools
 import hashlib
 import os
 from pathlib import Path
+from typing import Any, ClassVar  # ManiSkill is untyped
 from xml.etree import ElementTree
 
 from mani_skill import PACKAGE_ASSET_DIR
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
+from mani_skill.utils.building.urdf_loader import URDFLoader
 
 from vla_eval.storage.cache import cached
 from vla_eval.tasks.arm.camera_mesh import (
@@ -62,8 +64,46 @@ def changed_urdf(name: str, change: MeshChange) -> Path:
     return urdf
 
 
+ParsedArms = dict[str, Any]
+"""Path of a URDF -> what ManiSkill's loader made of it."""
+
+
+class _KeptLoader(URDFLoader):  # type: ignore[misc]  # ManiSkill is untyped
+    """Parses a file once: each episode has a new scene, and parsing took a third of its time."""
+
+    parsed: ParsedArms
+
+    def parse(self, urdf_file: str, srdf_file: Any = None, package_dir: Any = None) -> Any:
+        if urdf_file not in self.parsed:
+            self.parsed[urdf_file] = super().parse(urdf_file, srdf_file, package_dir)
+        for builder in self.parsed[urdf_file]["articulation_builders"]:
+            builder.set_scene(self.scene)
+        return self.parsed[urdf_file]
+
+
+def kept_loader(scene: Any, parsed: ParsedArms) -> URDFLoader:
+    """Return a loader for a scene that parses only what was not parsed before for the same environment."""
+    loader = _KeptLoader()
+    loader.set_scene(scene)
+    loader.parsed = parsed
+    return loader
+
+
+class KeptConfigs:
+    """An arm whose controllers' configurations are made once: ManiSkill copies all, twice per reset."""
+
+    _made: ClassVar[dict[type, Any]] = {}
+
+    @property
+    def _controller_configs(self) -> dict[str, dict[str, Any]]:
+        if type(self) not in self._made:
+            self._made[type(self)] = super()._controller_configs  # type: ignore[misc]  # the arm's
+        # ManiSkill takes parts out of the outer dictionaries.
+        return {mode: dict(parts) for mode, parts in self._made[type(self)].items()}
+
+
 @register_agent()
-class PandaWristCamSeen(PandaWristCam):  # type: ignore[misc]  # ManiSkill is untyped
+class PandaWristCamSeen(KeptConfigs, PandaWristCam):  # type: ignore[misc]  # ManiSkill is untyped
     """`panda_wristcam`, drawn without the triangles inside the camera's housing: the same images."""
 
     uid = "panda_wristcam_seen"
@@ -75,7 +115,7 @@ class PandaWristCamSeen(PandaWristCam):  # type: ignore[misc]  # ManiSkill is un
 
 
 @register_agent()
-class PandaWristCamLight(PandaWristCam):  # type: ignore[misc]  # ManiSkill is untyped
+class PandaWristCamLight(KeptConfigs, PandaWristCam):  # type: ignore[misc]  # ManiSkill is untyped
     """`panda_wristcam`, drawn with a simpler mesh of the camera: images differ a little."""
 
     uid = "panda_wristcam_light"
