@@ -1,4 +1,4 @@
-"""The mesh that ships draws what the whole mesh of the wrist camera draws."""
+"""What is left out of a picture because no view shows it: the same pixels as with everything."""
 
 from typing import Literal
 
@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 from tests.tasks.sample import SAMPLE
+from vla_eval.config.appearance import AppearanceSettings
 from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.core import ImageArray
 from vla_eval.envs.factory import make_env
+from vla_eval.envs.scenes import take_images
 
 CAMERAS = ("base_camera", "hand_camera")
 SEED = 1
@@ -40,3 +42,44 @@ def _frames(task: str, mesh: Literal["shipped", "whole"]) -> dict[str, ImageArra
         result = env.step({0: action}, render=drawn)[0]
     env.close()
     return dict(result.observation.images)
+
+
+@pytest.mark.parametrize(
+    ("task", "appearance"),
+    [
+        ("ShellGameTouch-v0", AppearanceSettings()),
+        ("ChainOfColors3-v0", AppearanceSettings(light=0.6, hue_deg=40, table_rgb=(0.2, 0.4, 0.3))),
+    ],
+)
+def test_the_wrist_camera_s_own_scene_shows_what_the_whole_scene_shows(
+    task: str, appearance: AppearanceSettings
+) -> None:
+    env = make_env(EnvSettings(task=task, cameras=CAMERAS, appearance=appearance))
+    (inner,), (view,) = env._envs, env._wrist_views
+    rng, n_apart = np.random.default_rng(0), 0
+    for seed in (1, 2):  # a new scene per episode
+        env.reset({0: seed}, render=False)
+        for _ in range(12):  # cue, delay, and what is revealed then; the hand turns about each axis
+            action = np.append(rng.uniform(-1, 1, 6), 0).astype(np.float32)
+            seen = env.step({0: action}, render=frozenset({0}))[0].observation.images
+            n_apart += view.submit(inner)
+            whole = take_images(inner, CAMERAS)
+            for camera in CAMERAS:
+                np.testing.assert_array_equal(seen[camera], whole[camera][0])
+    env.close()
+    assert n_apart > 12, "nearly all pictures were drawn with the whole scene"
+
+
+def test_the_arm_is_drawn_where_it_may_be_seen() -> None:
+    env = make_env(EnvSettings(task="RememberColor3-v0", cameras=("hand_camera",)))
+    env.reset({0: 1}, render=True)
+    (inner,), (view,) = env._envs, env._wrist_views
+    assert set(view._left_out) >= {f"panda_link{i}" for i in range(6)}
+    qpos = inner.agent.robot.get_qpos().clone()
+    assert view.submit(inner)
+    qpos[0, 5] = 0.5  # the hand is bent back: its camera sees the forearm
+    inner.agent.robot.set_qpos(qpos)
+    assert not view.submit(inner)
+    seen = take_images(inner, ("hand_camera",), view)["hand_camera"]
+    np.testing.assert_array_equal(seen, take_images(inner, ("hand_camera",))["hand_camera"])
+    env.close()

@@ -18,7 +18,8 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
-from vla_eval.envs.scenes import build, describe, take_human_image, take_images
+from vla_eval.envs.scenes import CPU_RENDERER, build, describe, render_backend, take_human_image, take_images
+from vla_eval.envs.wrist_view import WristView
 from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
@@ -60,6 +61,9 @@ class ManiSkillEnv:
             control_hz=CONTROL_HZ,
         )
         self.device = describe(self._envs[0], settings)
+        # On a GPU, an image takes a hundredth of the time.
+        on_cpu = not batched and render_backend(settings) == CPU_RENDERER
+        self._wrist_views = [WristView() if on_cpu else None for _ in self._envs]
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
         """Begin an episode in each of the given slots; see `SimEnv.reset`."""
@@ -108,7 +112,7 @@ class ManiSkillEnv:
         """Release the simulator."""
         for env in self._envs:
             env.close()
-        self._envs = []
+        self._envs, self._wrist_views = [], []
 
     def _by_env(self, slots: Mapping[int, object]) -> list[tuple[int, list[int]]]:
         """Return (environment index, its requested slots), in order."""
@@ -123,7 +127,7 @@ class ManiSkillEnv:
         env = self._envs[index]
         info = env.read_info()
         steps = [int(info["elapsed_steps"][slot % self._slots_per_env]) for slot in slots]
-        images = self._images(env, steps) if render.intersection(slots) else {}
+        images = self._images(index, steps) if render.intersection(slots) else {}
         state = {"tcp_pose": env.tcp_pose(), "qpos": env.qpos(), "qvel": env.qvel()}
         if env.PROMPT_DIMS:
             state["task_cue"] = env.prompt()
@@ -145,8 +149,9 @@ class ManiSkillEnv:
             )
         return results
 
-    def _images(self, env: Any, steps: list[int]) -> dict[str, ImageArray]:
-        images = take_images(env, self._settings.cameras)
+    def _images(self, index: int, steps: list[int]) -> dict[str, ImageArray]:
+        env = self._envs[index]
+        images = take_images(env, self._settings.cameras, self._wrist_views[index])
         if any(self._settings.shows_human_camera(step, self.spec.horizon_steps) for step in steps):
             images[HUMAN_CAMERA] = take_human_image(env)
         return images

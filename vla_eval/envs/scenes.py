@@ -8,6 +8,7 @@ import torch
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ImageArray
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
+from vla_eval.envs.wrist_view import WRIST_CAMERA, WristView
 from vla_eval.errors import RenderingError
 
 RENDERING_ADVICE = (
@@ -16,13 +17,16 @@ RENDERING_ADVICE = (
 )
 
 
+CPU_RENDERER = "sapien_cpu"
+
+
 def render_backend(settings: EnvSettings) -> str:
     """Return the name ManiSkill uses; without cameras no renderer is started at all."""
     if not settings.cameras:
         return "none"
     if settings.render.backend == "auto":
-        return "sapien_cuda" if torch.cuda.is_available() else "sapien_cpu"
-    return {"cpu": "sapien_cpu", "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
+        return "sapien_cuda" if torch.cuda.is_available() else CPU_RENDERER
+    return {"cpu": CPU_RENDERER, "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
 
 
 _kept: list[Any] = []  # SAPIEN has one renderer per process
@@ -74,19 +78,29 @@ def _render_device_name() -> str:
     return "unknown to SAPIEN"
 
 
-def take_images(env: Any, cameras: tuple[str, ...]) -> dict[str, ImageArray]:
-    """Return camera name -> (B, H, W, 3) uint8."""
+def take_images(
+    env: Any, cameras: tuple[str, ...], wrist_view: WristView | None = None
+) -> dict[str, ImageArray]:
+    """Return camera name -> (B, H, W, 3) uint8.
+
+    Args:
+        env: a ManiSkill environment.
+        cameras: their names.
+        wrist_view: draws the wrist camera's image where it can; None: all are drawn with the whole scene.
+    """
     if not cameras:
         raise RenderingError(
             "Images were requested, but this environment was made without cameras and has no renderer. "
             "Name the cameras in EnvSettings.cameras."
         )
     check_no_environment_map(env.scene)
-    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    sensors = {name: env.scene.sensors[name] for name in cameras}
+    apart = {WRIST_CAMERA} if wrist_view and WRIST_CAMERA in cameras and wrist_view.submit(env) else set()
+    sensors = {name: env.scene.sensors[name] for name in cameras if name not in apart}
+    if sensors:
+        env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
     for sensor in sensors.values():  # all are submitted before the first image is waited for
         sensor.capture()
-    images = {}
+    images = {name: wrist_view.image()[None] for name in apart if wrist_view}
     for name, sensor in sensors.items():
         textures = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
         images[name] = textures["rgb"].cpu().numpy()
