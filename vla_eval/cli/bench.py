@@ -125,6 +125,7 @@ def _loader(args: argparse.Namespace) -> int:
 
 
 def _rendering(args: argparse.Namespace) -> int:
+    from vla_eval.bench.parts import measure_parts
     from vla_eval.bench.rendering import run_bench
     from vla_eval.config.environment import RenderSettings
 
@@ -144,6 +145,10 @@ def _rendering(args: argparse.Namespace) -> int:
             f"| {row.eager_cpu_ms:.1f} | {row.lazy_cpu_ms:.1f} | {row.cpu_speed_up:.1f} |"
         )
     print("States and actions of lazy and eager episodes were bit-equal.")
+    print("| part | CPU ms |")
+    print("|:--|--:|")
+    for part in measure_parts(args.task, repeats=args.repeats):
+        print(f"| {part.name} | {part.cpu_ms:.2f} |")
     return 0
 
 

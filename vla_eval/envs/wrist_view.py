@@ -114,7 +114,7 @@ def _carried(env: Any, mount: str) -> set[str]:
 
 
 def _corners(entity: Any) -> NDArray[np.float64] | None:
-    """Return (8, 4): the corners of the box around an entity's meshes, in its frame; None if it has others."""
+    """Return (8, 4): the corners of the box around an entity's meshes, in its frame; None without meshes."""
     points = []
     for shape in _body(entity).render_shapes:
         if not isinstance(shape, sapien.render.RenderShapeTriangleMesh):

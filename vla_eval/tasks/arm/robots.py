@@ -76,6 +76,11 @@ class _KeptLoader(URDFLoader):  # type: ignore[misc]  # ManiSkill is untyped
     def parse(self, urdf_file: str, srdf_file: Any = None, package_dir: Any = None) -> Any:
         if urdf_file not in self.parsed:
             self.parsed[urdf_file] = super().parse(urdf_file, srdf_file, package_dir)
+            if not self.scene.can_render():
+                # Materials keep SAPIEN's renderer, and the next environment may need it on another device.
+                for builder in self.parsed[urdf_file]["articulation_builders"]:
+                    for link in builder.link_builders:
+                        link.visual_records.clear()
         for builder in self.parsed[urdf_file]["articulation_builders"]:
             builder.set_scene(self.scene)
         return self.parsed[urdf_file]
