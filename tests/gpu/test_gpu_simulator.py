@@ -4,7 +4,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import make_env
@@ -21,7 +20,7 @@ def test_candidates_lie_at_their_places_at_the_reveal_in_every_slot(task: str) -
     for _ in range(15):
         env.step({slot: env.hold_action(slot) for slot in range(N_SLOTS)}, render=frozenset())
     inner = env._envs[0]
-    assert torch.allclose(inner.candidate_positions_m(), inner._slots, atol=2e-3)
+    assert np.allclose(inner.candidate_positions_m(), inner._slots, atol=2e-3)
 
 
 def test_an_episode_does_not_depend_on_the_slots_beside_it() -> None:
