@@ -1,6 +1,7 @@
 """Arguments of the tasks: what is impossible or of another type is refused with a reason."""
 
-from typing import Any
+import math
+from typing import Any, get_args
 
 import pytest
 
@@ -8,6 +9,10 @@ from tests.tasks.made_tasks import make
 from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNameError
+from vla_eval.tasks.arguments import check_arguments
+from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.objects.limits import LIMITED, Limits
+from vla_eval.tasks.source import task_arguments
 
 
 @pytest.mark.parametrize(
@@ -17,7 +22,7 @@ from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNa
         ("RememberColor3-v0", {"n_items": 1}, "n_items=1: expected 2 to 9"),
         ("RememberColor3-v0", {"cue_steps": -1}, "cue_steps=-1: expected a number of control steps"),
         ("RememberColor3-v0", {"delay_steps": (5, 2)}, "delay_steps="),
-        ("RememberColor3-v0", {"goal_threshold_m": 0}, "goal_threshold_m=0: expected > 0"),
+        ("RememberColor3-v0", {"goal_threshold_m": 0}, "goal_threshold_m=0: expected a number > 0"),
         ("ShellGameTouch-v0", {"mug": "cup"}, "expected 'primitive' or 'ycb'"),
         ("InterceptMedium-v0", {"velocity_range_m_s": (2, 1)}, "0 < least ≤ most"),
         ("InterceptMedium-v0", {"delay_steps": 5}, "this task has no phases"),
@@ -38,6 +43,42 @@ def test_impossible_arguments_are_refused_with_a_reason(
 ) -> None:
     with pytest.raises(TaskArgumentError, match=message):
         make(task, **kwargs)
+
+
+def beyond(limits: Limits) -> list[float]:
+    """Numbers that are just too small or too large."""
+    below = limits.least if limits.above else limits.least - 1
+    return [below] if math.isinf(limits.most) else [below, limits.most + 1]
+
+
+LIMITED_ARGUMENTS = sorted(
+    {
+        (task, argument.name, argument.annotation.removesuffix(" | None"))
+        for task, row in TASKS.items()
+        if not row.is_official
+        for argument in task_arguments(row.entry_point)
+        if argument.annotation.removesuffix(" | None") in LIMITED
+    }
+)
+
+
+def test_a_number_beyond_its_limits_is_refused_before_anything_starts_and_by_the_class_itself() -> None:
+    assert {name for _, name, _ in LIMITED_ARGUMENTS} >= {
+        "n_items",
+        "n_shown",
+        "goal_threshold_m",
+        "swap_cue",
+    }
+    asked_of_class = set()
+    for task, name, kind in LIMITED_ARGUMENTS:
+        row = task_spec(task)
+        for number in beyond(get_args(LIMITED[kind])[1]):
+            with pytest.raises(TaskArgumentError, match=f"{name}={number}: expected"):
+                check_arguments(row, {name: number}, TASKS.values())
+            if (row.entry_point, name, number) not in asked_of_class:
+                asked_of_class.add((row.entry_point, name, number))
+                with pytest.raises(TaskArgumentError, match=f"{name}={number}: expected"):
+                    make(task, **{name: number})
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ No simulator is started: the task's row and the source of its class say it all.
 
 import ast
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from vla_eval.config.environment import WristMesh
 from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
@@ -24,6 +24,8 @@ from vla_eval.tasks.interface import (
     states,
     step_range,
 )
+from vla_eval.tasks.objects import limits
+from vla_eval.tasks.objects.limits import LIMITED
 from vla_eval.tasks.source import class_constant, task_arguments
 from vla_eval.tasks.spec import TaskSpec, total_cue_steps
 
@@ -35,6 +37,8 @@ ANNOTATIONS: Mapping[str, Any] = {  # Any: type annotations
     **{"int": int, "float": float, "bool": bool, "str": str},
     **{"float | None": float | None, "str | None": str | None},
     **{"StepRange": StepRange, "Sequence[float]": Sequence[float]},
+    **LIMITED,
+    **{f"{name} | None": kind | None for name, kind in LIMITED.items()},
 }
 """Annotation in the source of a task -> the type; arguments with another one are checked by the class."""
 
@@ -189,8 +193,12 @@ def offered_by(spec: TaskSpec, given: Mapping[str, object]) -> EnvSpec:
 def check_argument(hint: Any, value: object, *, name: str, task: str) -> None:  # Any: a type annotation
     """Raise `TaskArgumentError` unless an argument is of the type that the task declares for it."""
     try:
-        check_value(hint, value, path=name)
-    except RecipeError as exc:
+        limited = next((kind for kind in (hint, *get_args(hint)) if get_origin(kind) is Annotated), None)
+        is_given = value is not None or hint is limited
+        check_value(get_args(limited)[0] if limited and is_given else hint, value, path=name)
+        if limited and is_given:
+            limits.check(limited, **{name: value})
+    except (RecipeError, TaskArgumentError) as exc:
         raise TaskArgumentError(f"{task}: {exc}") from exc
 
 

@@ -12,8 +12,10 @@ from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.memory_env import poses
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Body, Flags, moving_body, position_of, velocity_of
-from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
+from vla_eval.tasks.objects.limits import Positive
+from vla_eval.tasks.without_cue import WithoutCueEnv
 
 SPAWN_X_M = (-0.35, -0.05)
 SPAWN_Y_M = (-0.9, -0.65)
@@ -36,7 +38,7 @@ class RollingBallEnv(WithoutCueEnv):
         self,
         *args: Any,
         velocity_range_m_s: Sequence[float] = (0.5, 0.75),
-        ball_radius_m: float = 0.02,
+        ball_radius_m: Positive = 0.02,
         **kwargs: Any,
     ) -> None:
         pair = tuple(float(v) for v in velocity_range_m_s)
@@ -44,7 +46,7 @@ class RollingBallEnv(WithoutCueEnv):
             raise TaskArgumentError(
                 f"velocity_range_m_s={velocity_range_m_s!r}: expected (least, most) with 0 < least ≤ most."
             )
-        check_positive(ball_radius_m=ball_radius_m)
+        limits.check(Positive, ball_radius_m=ball_radius_m)
         self.velocity_range_m_s = pair
         self.ball_radius_m = ball_radius_m
         super().__init__(*args, **kwargs)

@@ -12,11 +12,12 @@ from mani_skill.utils.structs import Actor
 from numpy.typing import NDArray
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import TaskArgumentError
 from vla_eval.task_state import PrivilegedState, TaskStatus, only_one
 from vla_eval.tasks.memory_env import MemoryTableEnv, Wxyz, nearness, poses
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere, length, positions_of
 from vla_eval.tasks.objects.layout import places_from_right
+from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
 
 NO_CHOICE = -1
@@ -44,14 +45,13 @@ class ChoiceEnv(MemoryTableEnv):
     def __init__(
         self,
         *args: Any,
-        goal_threshold_m: float,
+        goal_threshold_m: Positive,
         strict_choice: bool = False,
         show_cue: bool = True,
         cue_after_steps: int = 0,
         **kwargs: Any,
     ) -> None:
-        if not goal_threshold_m > 0:
-            raise TaskArgumentError(f"goal_threshold_m={goal_threshold_m}: expected > 0.")
+        limits.check(Positive, goal_threshold_m=goal_threshold_m)
         self.goal_threshold_m = goal_threshold_m
         self.strict_choice = strict_choice
         self.show_cue = show_cue

@@ -10,6 +10,7 @@ from mani_skill.utils.building import actors
 from vla_eval.core import FloatArray
 from vla_eval.tasks.ball import RollingBallEnv
 from vla_eval.tasks.memory_env import nearness, poses
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import (
     Body,
     Flags,
@@ -21,8 +22,8 @@ from vla_eval.tasks.objects.bodies import (
     spin_of,
     velocity_of,
 )
+from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
-from vla_eval.tasks.without_cue import check_positive
 
 GOAL_OFFSET_X_M = 0.2
 GOAL_Y_M = (-0.2, 0.2)
@@ -60,8 +61,8 @@ class InterceptEnv(RollingBallEnv):
     FAMILY = 3
     BALL_DROP_M = 0.02
 
-    def __init__(self, *args: Any, goal_radius_m: float = 0.1, **kwargs: Any) -> None:
-        check_positive(goal_radius_m=goal_radius_m)
+    def __init__(self, *args: Any, goal_radius_m: Positive = 0.1, **kwargs: Any) -> None:
+        limits.check(Positive, goal_radius_m=goal_radius_m)
         self.goal_radius_m = goal_radius_m
         super().__init__(*args, **kwargs)
 

@@ -4,10 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.ball import RollingBallEnv
 from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, length, pose_of, spin_of, velocity_of
+from vla_eval.tasks.objects.limits import CarryHeight
 from vla_eval.tasks.tensors_out import Info
 
 # The ball lies between the fingers: within this in x and in y of the tool centre point,
@@ -47,11 +48,8 @@ class InterceptGrabEnv(RollingBallEnv):
     FAMILY = 9
     BALL_DROP_M = 0.0
 
-    def __init__(self, *args: Any, lift_height_m: float = 0.0, **kwargs: Any) -> None:
-        if not 0 <= lift_height_m <= 0.5:
-            raise TaskArgumentError(
-                f"lift_height_m={lift_height_m}: expected 0 to 0.5, what the arm reaches."
-            )
+    def __init__(self, *args: Any, lift_height_m: CarryHeight = 0.0, **kwargs: Any) -> None:
+        limits.check(CarryHeight, lift_height_m=lift_height_m)
         self.lift_height_m = lift_height_m
         super().__init__(*args, **kwargs)
 

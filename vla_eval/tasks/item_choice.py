@@ -168,9 +168,3 @@ class ItemChoiceEnv(ChoiceEnv):
     def _reveal_all(self, mask: Flags) -> None:
         self._set_visible(mask, True)
         self.reveal(mask, UPRIGHT_WXYZ)
-
-
-def check_count(name: str, count: Any, most: int, what: str, *, least: int = 2) -> None:
-    """Raise `TaskArgumentError` unless a count is a whole number from `least` to `most`."""
-    if not isinstance(count, int) or isinstance(count, bool) or not least <= count <= most:
-        raise TaskArgumentError(f"{name}={count!r}: expected {least} to {most}, one per {what}.")

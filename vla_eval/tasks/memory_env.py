@@ -34,7 +34,9 @@ from vla_eval.tasks.arm import fetch, robots  # noqa: F401  importing them regis
 from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS, Arm
 from vla_eval.tasks.arm.robots import ParsedArms, kept_loader
 from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, checked_image_size, step_range
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Body, Flags, Indices, Steps, anywhere, velocity_of
+from vla_eval.tasks.objects.limits import NotNegative, Positive
 from vla_eval.tasks.tensors_out import Info, TensorsOut
 
 QPOS_NOISE_RAD = 0.02
@@ -104,11 +106,11 @@ class MemoryTableEnv(TensorsOut):
         image_size: int = IMAGE_SIZE_PX,
         cue_steps: StepRange = 5,
         delay_steps: StepRange = 5,
-        swap_cue: int = 0,
+        swap_cue: NotNegative = 0,
         freeze_until_choice: bool = False,
         move_in_delay: bool = False,
         phase_gate_success: bool = True,
-        static_threshold_rad_s: float = 0.2,
+        static_threshold_rad_s: Positive = 0.2,
         instruction: str | None = None,
         reconfiguration_freq: int | None = None,
         **kwargs: Any,
@@ -125,8 +127,7 @@ class MemoryTableEnv(TensorsOut):
         if robot_uids not in self.SUPPORTED_ROBOTS:
             raise unknown_name("robot_uids", robot_uids, self.SUPPORTED_ROBOTS, where=type(self).__name__)
         self.arm: Arm = ARMS[robot_uids]
-        if static_threshold_rad_s <= 0:
-            raise TaskArgumentError(f"static_threshold_rad_s={static_threshold_rad_s}: expected > 0.")
+        limits.check(Positive, static_threshold_rad_s=static_threshold_rad_s)
         self._parsed_arms: ParsedArms = {}
         # Without it an unseeded reset would repeat the last episode: ManiSkill then keeps the old seed.
         kwargs.setdefault("enhanced_determinism", True)

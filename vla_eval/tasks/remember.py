@@ -12,11 +12,13 @@ from numpy.typing import NDArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.arm.arms import FETCH_UID
-from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
+from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.memory_env import nearness
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
 from vla_eval.tasks.objects.layout import Plane, jittered_apart, slot_centres_m
+from vla_eval.tasks.objects.limits import CubeHalfSize, ItemCount, MixedColorCount, MixedShapeCount, Positive
 from vla_eval.tasks.tensors_out import Info
 
 SHAPE_COLOR = COLORS[2]  # blue, as in the official RememberShape
@@ -52,7 +54,7 @@ class RememberEnv(ItemChoiceEnv):
     SLOWING_WEIGHT = 0.5
     RESTING_WEIGHT = 0.5
 
-    def __init__(self, *args: Any, goal_threshold_m: float = 0.05, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, goal_threshold_m: Positive = 0.05, **kwargs: Any) -> None:
         """Set the threshold of these tasks and build the scene."""
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
 
@@ -105,9 +107,13 @@ class RememberColorEnv(RememberEnv):
     FAMILY = 1
 
     def __init__(
-        self, *args: Any, n_items: int = 3, cube_half_size_m: float = CUBE_HALF_SIZE_M, **kwargs: Any
+        self,
+        *args: Any,
+        n_items: ItemCount = 3,
+        cube_half_size_m: CubeHalfSize = CUBE_HALF_SIZE_M,
+        **kwargs: Any,
     ) -> None:
-        check_count("n_items", n_items, len(COLORS), "colour")
+        limits.check(ItemCount, n_items=n_items)
         shape = cube(cube_half_size_m)
         super().__init__(*args, items=tuple(Item(shape, color) for color in COLORS[:n_items]), **kwargs)
 
@@ -120,8 +126,8 @@ class RememberShapeEnv(RememberEnv):
 
     FAMILY = 4
 
-    def __init__(self, *args: Any, n_items: int = 3, **kwargs: Any) -> None:
-        check_count("n_items", n_items, len(SHAPES), "shape")
+    def __init__(self, *args: Any, n_items: ItemCount = 3, **kwargs: Any) -> None:
+        limits.check(ItemCount, n_items=n_items)
         shapes = list(SHAPES.values())[:n_items]
         super().__init__(*args, items=tuple(Item(shape, SHAPE_COLOR) for shape in shapes), **kwargs)
 
@@ -136,10 +142,15 @@ class RememberShapeAndColorEnv(RememberEnv):
     FAMILY = 5
 
     def __init__(
-        self, *args: Any, n_shapes: int = 3, n_colors: int = 2, official_3x2: bool = False, **kwargs: Any
+        self,
+        *args: Any,
+        n_shapes: MixedShapeCount = 3,
+        n_colors: MixedColorCount = 2,
+        official_3x2: bool = False,
+        **kwargs: Any,
     ) -> None:
-        check_count("n_shapes", n_shapes, len(MIXED_SHAPES), "shape", least=1)
-        check_count("n_colors", n_colors, len(MIXED_COLORS), "colour", least=1)
+        limits.check(MixedShapeCount, n_shapes=n_shapes)
+        limits.check(MixedColorCount, n_colors=n_colors)
         if n_shapes * n_colors < 2:
             raise TaskArgumentError("n_shapes × n_colors is 1: expected at least two items to choose among.")
         if official_3x2:

@@ -14,6 +14,7 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.task_state import TaskStatus
 from vla_eval.tasks.memory_env import poses
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import (
     Body,
     Flags,
@@ -26,8 +27,9 @@ from vla_eval.tasks.objects.bodies import (
     wrapped_rad,
     yaw_rad,
 )
+from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
-from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
+from vla_eval.tasks.without_cue import WithoutCueEnv
 
 PEG_RANGE_M = 0.1  # the peg's centre is within ± this in x and y
 PEG_RGBA = (12 / 255, 42 / 255, 160 / 255, 1.0)
@@ -75,14 +77,15 @@ class RotateEnv(WithoutCueEnv):
         angle_range_rad: Sequence[float] = (0.1, math.pi / 2),
         signed: bool = False,
         official_signs: bool = False,
-        angle_threshold_rad: float = 0.1,
-        position_threshold_m: float | None = None,
-        tilt_threshold_rad: float | None = None,
-        peg_half_length_m: float = 0.12,
-        peg_half_width_m: float = 0.025,
+        angle_threshold_rad: Positive = 0.1,
+        position_threshold_m: Positive | None = None,
+        tilt_threshold_rad: Positive | None = None,
+        peg_half_length_m: Positive = 0.12,
+        peg_half_width_m: Positive = 0.025,
         **kwargs: Any,
     ) -> None:
-        check_positive(
+        limits.check(
+            Positive,
             angle_threshold_rad=angle_threshold_rad,
             peg_half_length_m=peg_half_length_m,
             peg_half_width_m=peg_half_width_m,
@@ -92,7 +95,7 @@ class RotateEnv(WithoutCueEnv):
             ("tilt_threshold_rad", tilt_threshold_rad),
         ):
             if limit is not None:
-                check_positive(**{name: limit})
+                limits.check(Positive, **{name: limit})
         self.angle_range_rad = _in_order(angle_range_rad, least_rad=angle_threshold_rad)
         if self.angle_range_rad[1] > math.pi:
             raise TaskArgumentError(f"angle_range_rad={angle_range_rad!r}: expected at most π.")

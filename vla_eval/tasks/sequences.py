@@ -13,10 +13,19 @@ from numpy.typing import NDArray
 from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
-from vla_eval.tasks.item_choice import ItemChoiceEnv, check_count
+from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.memory_env import Place, nearness
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
+from vla_eval.tasks.objects.limits import (
+    CubeHalfSize,
+    DwellSteps,
+    ItemCount,
+    NotNegative,
+    Positive,
+    ShownCount,
+)
 from vla_eval.tasks.spec import chance_of_several, total_cue_steps
 from vla_eval.tasks.tensors_out import Info
 
@@ -25,7 +34,6 @@ TOUCH_RADIUS_M = 0.02
 # Cubes that are shown together lie on an arc, compressed in y by this much per place (official constants).
 BUNCH_RADIUS_M = 0.22
 BUNCH_SQUEEZE_M = 0.015
-MAX_STEPS = 10_000  # of anything: 500 s
 FOUND_REWARD = 90.0
 MISTAKE_REWARD = -10.0
 
@@ -87,21 +95,23 @@ class SeveralColorsEnv(ItemChoiceEnv):
     def __init__(
         self,
         *args: Any,
-        n_items: int = 9,
-        n_shown: int = 3,
-        gap_steps: int = 0,
-        dwell_steps: int = 1,
-        swap_order: int = 0,
+        n_items: ItemCount = 9,
+        n_shown: ShownCount = 3,
+        gap_steps: NotNegative = 0,
+        dwell_steps: DwellSteps = 1,
+        swap_order: NotNegative = 0,
         shuffle_cue: bool = False,
-        goal_threshold_m: float = TOUCH_RADIUS_M,
-        cube_half_size_m: float = CUBE_HALF_SIZE_M,
+        goal_threshold_m: Positive = TOUCH_RADIUS_M,
+        cube_half_size_m: CubeHalfSize = CUBE_HALF_SIZE_M,
         phase_gate_success: bool = True,
         **kwargs: Any,
     ) -> None:
-        check_count("n_items", n_items, len(COLORS), "colour")
-        check_count("n_shown", n_shown, n_items, "cube on the table", least=1)
-        check_count("gap_steps", gap_steps, MAX_STEPS, "step", least=0)
-        check_count("dwell_steps", dwell_steps, MAX_STEPS, "step", least=1)
+        limits.check(ItemCount, n_items=n_items)
+        limits.check(ShownCount, n_shown=n_shown)
+        if n_shown > n_items:
+            raise TaskArgumentError(f"n_shown={n_shown}: expected at most n_items={n_items}.")
+        limits.check(NotNegative, gap_steps=gap_steps)
+        limits.check(DwellSteps, dwell_steps=dwell_steps)
         if gap_steps and not self.ONE_BY_ONE:
             raise TaskArgumentError(f"gap_steps={gap_steps}: the cubes of this task are shown together.")
         if not phase_gate_success:

@@ -12,6 +12,7 @@ import numpy as np
 from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.memory_env import Wxyz, nearness
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import (
     Body,
     Flags,
@@ -24,9 +25,9 @@ from vla_eval.tasks.objects.bodies import (
     velocity_of,
     yaw_rad,
 )
+from vla_eval.tasks.objects.limits import LiftHeight, Positive
 from vla_eval.tasks.shell_game import BALL_RADIUS_M, N_MUGS, ShellGameEnv
 from vla_eval.tasks.tensors_out import Info
-from vla_eval.tasks.without_cue import check_positive
 
 CHOSEN_M = 0.02
 GOAL_ABOVE_BALL_M = 0.025
@@ -124,10 +125,10 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     REACH_SCALE_PER_M = 10.0
 
     def __init__(
-        self, *args: Any, push_distance_m: float = 0.1, goal_threshold_m: float = 0.08, **kwargs: Any
+        self, *args: Any, push_distance_m: Positive = 0.1, goal_threshold_m: Positive = 0.08, **kwargs: Any
     ) -> None:
         """Refuse a goal that contains the mug's first position."""
-        check_positive(push_distance_m=push_distance_m)
+        limits.check(Positive, push_distance_m=push_distance_m)
         if not 0 < goal_threshold_m < push_distance_m:
             raise TaskArgumentError(
                 f"goal_threshold_m={goal_threshold_m}: expected > 0 and less than push_distance_m="
@@ -174,14 +175,13 @@ class ShellGamePickEnv(ShellGameMoveEnv):
     def __init__(
         self,
         *args: Any,
-        lift_height_m: float = 0.1,
-        goal_threshold_m: float | None = None,
+        lift_height_m: LiftHeight = 0.1,
+        goal_threshold_m: Positive | None = None,
         official_mug_yaws: bool = False,
         **kwargs: Any,
     ) -> None:
         """Refuse a goal that contains the mug's first position, and one that the arm cannot reach."""
-        if not 0 < lift_height_m <= 0.4:
-            raise TaskArgumentError(f"lift_height_m={lift_height_m}: expected > 0 and at most 0.4.")
+        limits.check(LiftHeight, lift_height_m=lift_height_m)
         if goal_threshold_m is not None and not 0 < goal_threshold_m < lift_height_m:
             raise TaskArgumentError(
                 f"goal_threshold_m={goal_threshold_m}: expected > 0 and less than lift_height_m="

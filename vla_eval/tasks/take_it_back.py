@@ -11,6 +11,7 @@ from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.intercept import UPWARDS_WXYZ
 from vla_eval.tasks.memory_env import nearness, poses
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import (
     Body,
     Flags,
@@ -23,8 +24,9 @@ from vla_eval.tasks.objects.bodies import (
     resting_body,
     velocity_of,
 )
+from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
-from vla_eval.tasks.without_cue import WithoutCueEnv, check_positive
+from vla_eval.tasks.without_cue import WithoutCueEnv
 
 START_X_M = (-0.05, 0.05)
 START_BANDS_Y_M = (-0.1, 0.0, 0.1)
@@ -72,14 +74,17 @@ class TakeItBackEnv(WithoutCueEnv):
     def __init__(
         self,
         *args: Any,
-        goal_radius_m: float = 0.08,
-        return_radius_m: float = 0.08,
-        cube_half_size_m: float = 0.02,
+        goal_radius_m: Positive = 0.08,
+        return_radius_m: Positive = 0.08,
+        cube_half_size_m: Positive = 0.02,
         latch_goal_color: bool = True,
         **kwargs: Any,
     ) -> None:
-        check_positive(
-            goal_radius_m=goal_radius_m, return_radius_m=return_radius_m, cube_half_size_m=cube_half_size_m
+        limits.check(
+            Positive,
+            goal_radius_m=goal_radius_m,
+            return_radius_m=return_radius_m,
+            cube_half_size_m=cube_half_size_m,
         )
         if goal_radius_m >= GOAL_X_M[0] - START_X_M[1]:
             raise TaskArgumentError(

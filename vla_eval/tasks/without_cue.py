@@ -24,10 +24,3 @@ class WithoutCueEnv(MemoryTableEnv):
 
     def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         return False
-
-
-def check_positive(**numbers: float) -> None:
-    """Raise `TaskArgumentError` unless every number is > 0."""
-    for name, number in numbers.items():
-        if isinstance(number, bool) or not isinstance(number, int | float) or not number > 0:
-            raise TaskArgumentError(f"{name}={number!r}: expected a number > 0.")

@@ -14,8 +14,9 @@ import sapien
 from mani_skill.envs.scene import ManiSkillScene
 from mani_skill.utils.structs import Actor
 
-from vla_eval.errors import TaskArgumentError
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.item_names import COLOR_RGB
+from vla_eval.tasks.objects.limits import CubeHalfSize
 
 S = 0.02  # m, the official scale: half the edge of a cube
 BAR = 0.375 * S
@@ -77,7 +78,6 @@ def _star_point(angle_rad: float) -> Primitive:
 
 
 CUBE_HALF_SIZE_M = S
-CUBE_HALF_SIZE_RANGE_M = (0.01, 0.03)  # cubes lie at least 6 cm apart: larger ones would overlap
 
 
 def cube(half_size_m: float) -> Shape:
@@ -86,11 +86,7 @@ def cube(half_size_m: float) -> Shape:
     Raises:
         TaskArgumentError: too small for the arm to aim at, or so large that neighbours would overlap.
     """
-    least, most = CUBE_HALF_SIZE_RANGE_M
-    if not least <= half_size_m <= most:
-        raise TaskArgumentError(
-            f"cube_half_size_m={half_size_m}: expected {least} to {most}; neighbours may lie 6 cm apart."
-        )
+    limits.check(CubeHalfSize, cube_half_size_m=half_size_m)
     half = float(half_size_m)
     return Shape(name="cube", parts=(Primitive(kind="box", size=(half, half, half)),), rest_height_m=half)
 
