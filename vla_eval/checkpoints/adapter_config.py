@@ -1,8 +1,4 @@
-"""The description of a LoRA adapter (`adapter_config.json`), checked before peft is given anything of it.
-
-peft imports modules that some of its fields name, reads files that others name, and lets others change the
-weights of the base. An adapter that this program loads is plain LoRA: what it may say is listed here.
-"""
+"""What `adapter_config.json` of a LoRA adapter may say, checked before peft is given anything of it."""
 
 import dataclasses
 from collections.abc import Mapping

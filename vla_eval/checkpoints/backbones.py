@@ -1,8 +1,4 @@
-"""Trained backbones of policies that otherwise start from scratch: fetched like a base, never by torchvision.
-
-lerobot's ACT and Diffusion Policy build a network of torchvision, which would download the weights that
-`pretrained_backbone_weights` names. Here they come from the folder that `checkpoint fetch` makes.
-"""
+"""Trained backbones: from the folder that `checkpoint fetch` makes, never by torchvision's download."""
 
 import contextlib
 from collections.abc import Iterator, Mapping

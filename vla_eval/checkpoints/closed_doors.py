@@ -1,8 +1,4 @@
-"""The functions of libraries that import code, unpickle, or open more than data: closed while files are read.
-
-Each is replaced once by one that asks whether a checkpoint is open. If so it refuses, in every thread; a
-refusal that a library swallows is raised at the end. `foreign_code` says which doors there are.
-"""
+"""The functions that import code, unpickle, or open more than data: they refuse while files are read."""
 
 import contextlib
 import functools

@@ -1,8 +1,4 @@
-"""What `config.json` of a LeRobot policy may hold, asked before lerobot decodes it. Standard library only.
-
-draccus, which lerobot decodes it with, makes 1 of true and 4 of "4"; a chunk of 10⁹ actions would fill the
-machine's memory before anything could be said about it.
-"""
+"""What `config.json` may hold, asked before draccus decodes it, which makes 1 of true and 4 of "4"."""
 
 import dataclasses
 import math

@@ -1,8 +1,4 @@
-"""Fields of LeRobot's configurations that say how chunks are executed, and how each is answered here.
-
-LeRobot's own loop (`select_action`) reads them. A test compares this table with the installed lerobot.
-Standard library only.
-"""
+"""Fields of LeRobot's configurations that say how chunks are executed, and how each is answered here."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

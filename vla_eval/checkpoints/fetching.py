@@ -1,8 +1,4 @@
-"""Fetch a published checkpoint from the Hub, check it, and convert it where needed. Runs none of its code.
-
-What is fetched is settled first: one commit of each repository, the files, their sizes and digests, and
-whether they fit on the disk. After an interruption the same call resumes.
-"""
+"""Fetch a published checkpoint from the Hub, check and convert it. Runs none of its code."""
 
 import contextlib
 import dataclasses
@@ -59,10 +55,7 @@ class RemotePart:
 def fetch_base(
     base: Base, out: Path, *, revision: str | None = None, api: HfApi | None = None, say: Say
 ) -> Path:
-    """Make the folder `out` of a base checkpoint; one that is there is only checked.
-
-    `revision`: branch, tag or commit of the repository with the weights; None: the pinned one.
-    """
+    """Make the folder `out` of a base, or check it; `revision` None: the pinned one."""
     if out.exists():
         say(f"{out} is there: {_check(base, out)}")
         return out

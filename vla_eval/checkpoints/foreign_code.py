@@ -1,8 +1,4 @@
-"""Run no Python code that a checkpoint, or a tokenizer or backbone that it names, brings along.
-
-Here are the functions of lerobot, transformers and peft that all such code goes through, and what they may
-still do; docs/security.md lists them.
-"""
+"""Run no Python code that a checkpoint, tokenizer or backbone brings along: docs/security.md."""
 
 import contextlib
 import functools
@@ -72,11 +68,7 @@ TRUSTS = (
 
 @contextlib.contextmanager
 def no_foreign_code(kind: str) -> Iterator[None]:
-    """Let nothing that a checkpoint names be run while it is loaded, unless it is checked or installed.
-
-    What the family of this type replaces in lerobot stands there meanwhile. Code that would have been run is
-    a `CheckpointError`, also where lerobot or transformers caught the error.
-    """
+    """Let nothing that a checkpoint names be run while it is loaded, unless checked or installed."""
     with contextlib.ExitStack() as stack:
         stack.enter_context(only_data())
         stack.enter_context(processors_through_the_door())
@@ -89,10 +81,7 @@ def no_foreign_code(kind: str) -> Iterator[None]:
 
 @contextlib.contextmanager
 def only_data() -> Iterator[None]:
-    """Keep the doors closed within the context, as `no_foreign_code`; cheap enough for every forward pass.
-
-    Some policies open a tokenizer only in the first one.
-    """
+    """Keep the doors closed, as `no_foreign_code`; cheap enough for every forward pass."""
     replace(_doors())
     with closed():
         yield

@@ -1,8 +1,4 @@
-"""The one door through which a saved processor comes in: names are resolved and steps are made here.
-
-lerobot imports and calls whatever a checkpoint names. Here a name is first looked at as text, then only
-modules of processors of installed packages are imported, then class and settings are checked.
-"""
+"""The one door for saved processors: a name is looked at as text before anything is imported."""
 
 import contextlib
 import importlib

@@ -1,8 +1,4 @@
-"""Ask a LeRobot policy that cannot be given frames from outside: one `select_action` per control step.
-
-Such a policy collects frames, and what is left of its chunk, in queues of its own. Each episode has its own
-instance of them: it is put in before the policy is asked, and taken out afterwards.
-"""
+"""Ask a policy for one action per step; each episode has its own instance of the policy's queues."""
 
 import copy
 from collections.abc import Mapping

@@ -89,10 +89,7 @@ def refuse_differences(lines: Iterable[str], *, policy: str, task: str) -> None:
 
 
 def about_sentence(trained: Sentences | None, sentence: str, *, policy: str, task: str) -> str | None:
-    """Return a line if a policy is asked with a sentence that it was never trained with; else None.
-
-    It is not an error: a paraphrase may be what is tested. Words in braces differ per episode.
-    """
+    """Return a line if a policy is asked with a sentence that it was never trained with; else None."""
     if not trained:
         return None
     known = trained.get(task) or [one for own in trained.values() for one in own]

@@ -28,10 +28,7 @@ INSTRUCTION = "pick the cube"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verified:
-    """What was found; shared parameters count once, `n_trained` are those that the configuration trains.
-
-    `statistics` are `field.statistic`, `chunk` is the shape of one forward pass's actions, `sha256` as noted.
-    """
+    """What was found; `statistics` are `field.statistic`, `chunk` is the shape of one pass's actions."""
 
     folder: Path
     kind: str

@@ -1,8 +1,4 @@
-"""Check `meta/info.json` of a LeRobotDataset before lerobot reads it.
-
-lerobot fills in the templates of paths with `str.format`, which can reach any attribute of what it is given,
-and takes text for numbers. Knows nothing of the files that the templates name.
-"""
+"""Check `meta/info.json` before lerobot reads it: its templates can reach any attribute."""
 
 import math
 import os

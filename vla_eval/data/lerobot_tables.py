@@ -1,8 +1,4 @@
-"""The files of a dataset in the form in which lerobot keeps them: what its own loaders would return.
-
-Each function below replaces one of `lerobot.datasets.io_utils`, which reads by Hugging Face's `datasets` (see
-`tables.py`), caches what it read by the file's name and time, and takes brackets in a path for a pattern.
-"""
+"""Functions that replace `lerobot.datasets.io_utils`: the same answers, read by `tables.py`."""
 
 import functools
 from collections.abc import Callable, Sequence

@@ -1,7 +1,4 @@
-"""The families of policies, a row for each: ours and those of LeRobot's that a row is needed for.
-
-Types that are understood from their configuration alone need no row. Standard library only.
-"""
+"""The families of policies: a row for each that needs more than its configuration says."""
 
 import importlib
 from collections.abc import Mapping

@@ -1,8 +1,4 @@
-"""Policies that are Python objects: an instance, a class or a function of a script or a notebook.
-
-Workers get a copy by cloudpickle, which takes along what was defined in a notebook. Only what this process
-was given is ever pickled; nothing from a file gets here.
-"""
+"""Policies that are Python objects; workers get a copy by cloudpickle. Nothing from a file gets here."""
 
 import functools
 import hashlib
@@ -62,10 +58,7 @@ def make_given(context: PolicyContext, *, given: GivenPolicy) -> Policy:
 
 
 def given_entry(found: object, *, name: str | None = None) -> PolicyEntry:
-    """Return an object (or a class or function that makes one, from a context or nothing) as an entry.
-
-    Without a name it is called as its class or function, an instance as its `spec` says.
-    """
+    """Return an object, or a class or function that makes one from a context or nothing, as an entry."""
     name = name or _name_of(found)
     check_recorded_name(name, kind="policy")
     if name in list_recipes("policies"):  # tables know `oracle` and `cue_blind` by their names
@@ -91,10 +84,7 @@ def given_entry(found: object, *, name: str | None = None) -> PolicyEntry:
 
 
 def identity_of(found: object) -> str:
-    """Return the sha256 of what an object consists of: its code, its values, and the files of its modules.
-
-    A digest that differs without need only starts a new run folder.
-    """
+    """Return the sha256 of an object's code, values and modules; another only starts a new run."""
     digest = hashlib.sha256(_dumped(found, _Describer))
     of_class = found if inspect.isclass(found) else type(found)
     modules = {one.__module__ for one in of_class.__mro__} | {getattr(found, "__module__", "")}

@@ -55,10 +55,7 @@ def write_checkpoint(
 
 @contextlib.contextmanager
 def _recurrent_weights_apart(policy: nn.Module) -> Iterator[None]:
-    """Let a policy's `state_dict` have each weight of a GRU or LSTM in a storage of its own, for safetensors.
-
-    On a GPU torch keeps all of them in one, as cuDNN wants it (`flatten_parameters`).
-    """
+    """Let each weight of a GRU or LSTM have a storage of its own: cuDNN's is one, for all."""
 
     def copied(module: nn.Module, state: dict[str, Any], prefix: str, metadata: Any) -> None:
         for name, _ in module.named_parameters():

@@ -225,10 +225,7 @@ def _open(job: TrainingJob, config: FinetuneConfig, command: str) -> Path | None
 
 @contextlib.contextmanager
 def _opened(job: TrainingJob, config: FinetuneConfig, command: str) -> Iterator[Path | None]:
-    """Open the run folder, and give the checkpoint to resume from, None at the beginning.
-
-    A mistake that is found before the first step leaves no folder behind.
-    """
+    """Open the run folder, and give the checkpoint to resume from, None at the beginning."""
     if not _is_first_process():  # the first one has the lock, and checks
         yield next(reversed(whole_checkpoints(job.out)), None)
         return

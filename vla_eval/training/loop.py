@@ -1,8 +1,6 @@
-"""The training loop: gradient steps, checkpoints, metrics. Knows nothing of run folders or listeners.
+"""The training loop; `lerobot-train --resume` continues from its checkpoints.
 
-It uses accelerate and the public parts of lerobot: its factories, its sampler, its form of a checkpoint, so
-that `lerobot-train --resume` continues from ours. All noise of a step is drawn from (run seed,
-step, process): a run that was killed and resumed gives the same weights.
+All noise of a step is drawn from (run seed, step, process): a resumed run gives the same weights.
 """
 
 import contextlib

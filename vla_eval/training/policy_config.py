@@ -129,11 +129,7 @@ def _set_window(config: Any, dataset: OpenDataset) -> None:
 
 
 def masks_padding(config: Any) -> bool:
-    """Whether the policy leaves actions beyond the episode's end out of its loss.
-
-    `masks_padding` of its configuration says it. Without that, its code shows it: one that never reads
-    `action_is_pad` (π0, π0.5, π0-FAST, …) cannot.
-    """
+    """Whether the policy leaves actions beyond the end out of its loss, as it or its code says."""
     said = getattr(config, "masks_padding", None)
     if said is not None:
         return bool(said)

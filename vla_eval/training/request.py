@@ -102,10 +102,7 @@ def compared_fields(recipe: FinetuneRecipe) -> dict[str, Any]:  # Any: plain dat
 
 
 def request_sha256(recipe: FinetuneRecipe, dataset: Path, base_sha256: str | None, *, run_seed: int) -> str:
-    """Return a digest of all that the weights depend on: recipe, seed, base, and the dataset's facts.
-
-    Where it is as it was, so are the settings of the run. Where it is not, they may be all the same.
-    """
+    """Return a digest of all that the weights depend on: recipe, seed, base, dataset's facts."""
     files = [dataset / kind.file for kind in KINDS]  # digests of all others
     facts = [file_sha256(file) for file in files if file.is_file()]
     return digest_of([compared_fields(recipe), run_seed, facts, dataset.resolve().name, base_sha256])

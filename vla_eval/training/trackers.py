@@ -138,10 +138,7 @@ def _trackio(job: TrainingJob) -> Service:
 
 
 def _wandb(job: TrainingJob) -> Service:
-    """Begin or resume a run of wandb; WANDB_MODE and its other variables say how.
-
-    Not by lerobot's logger: it overrules WANDB_MODE, and looks for its last run by a pattern in the folder.
-    """
+    """Begin or resume a run of wandb; not by lerobot's logger, which overrules WANDB_MODE."""
     os.environ.setdefault("WANDB_ERROR_REPORTING", "false")  # to wandb's makers: nobody has asked for it
     wandb: Any = importlib.import_module("wandb")
     config, folder = lerobot_config(job), job.out / TRAIN_FOLDER

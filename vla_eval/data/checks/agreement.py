@@ -1,8 +1,4 @@
-"""Whether the files of a LeRobotDataset belong together: counts, rows, times, videos. Decodes nothing.
-
-lerobot reads a frame by the times and places that the tables name: where these are wrong, it serves another
-frame without an error.
-"""
+"""Whether the files of a LeRobotDataset belong together: counts, rows, times, videos."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise

@@ -131,11 +131,7 @@ def _aggregate(roots: Sequence[Path], draft: Path) -> None:
 
 
 def write_statistics(root: Path, metas: Sequence[Any]) -> None:
-    """Write statistics over all frames: of numbers from their rows, of images from those of the sources.
-
-    Those of images have no quantiles: what the sources know of them does not give that of all pixels. The
-    rest is exact (`exact_statistics` says what lerobot makes of quantiles).
-    """
+    """Write exact statistics of numbers, and those of images, without quantiles, from the sources'."""
     numbers = {key: rows.reshape(len(rows), -1) for key, rows in read_columns(root).items()}
     cameras = metas[0].video_keys
     images = aggregate_stats(

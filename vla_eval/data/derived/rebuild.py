@@ -1,8 +1,4 @@
-"""Rebuild a dataset from its manifest: an episode is a function of (task, arguments, seed, actions).
-
-For a dataset whose videos or tables are damaged or were never fetched, and for one that is to be
-rendered with other settings. It runs the second pass of a recording, with its shards and its checks.
-"""
+"""Rebuild a dataset from its manifest: an episode is a function of (task, arguments, seed, actions)."""
 
 import dataclasses
 from dataclasses import dataclass

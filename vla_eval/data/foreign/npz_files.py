@@ -1,10 +1,9 @@
 """Read demonstrations from `*.npz`, one file per episode. Files are never unpickled.
 
-- As the paper's recordings have it: `rgb (T, H, W, 6)` uint8 base camera, then wrist camera;
-  `joints (T, 25)`; `action (T, 7 or 8)`; `reward`, `success`, `done` (T,).
-- As the authors' later recordings for vision-language-action models have it: instead of `joints`,
-  `proprio (T, 7)`, position, roll, pitch, yaw, gripper width; in addition `language_instruction`,
-  `episode_seed`.
+- The paper's: `rgb (T, H, W, 6)` uint8 base, then wrist camera; `joints (T, 25)`; `action (T, 7 or 8)`;
+  `reward`, `success`, `done` (T,).
+- The authors' later ones, for VLAs: instead of `joints` `proprio (T, 7)`, position, roll, pitch, yaw,
+  gripper width; also `language_instruction`, `episode_seed`.
 """
 
 import re

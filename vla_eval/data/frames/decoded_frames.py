@@ -161,10 +161,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
 
 
 def _columns(source: LeRobotDataset) -> dict[str, Any]:
-    """Return column -> a tensor with one row per frame, or the list of values if they are not numbers.
-
-    Types as lerobot's own transform, `torch.tensor` of Python numbers, has them.
-    """
+    """Return column -> a tensor with one row per frame, or the list of values if no numbers."""
     refused = [key for key in source.meta.camera_keys if key not in source.meta.video_keys]
     refused += list(source.meta.depth_keys)
     if refused:

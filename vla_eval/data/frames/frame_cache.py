@@ -1,8 +1,4 @@
-"""Decoded frames of a dataset in files that can be mapped into memory: made once, found again by digest.
-
-One `<camera>.npy` (N, 3, H, W) uint8 per camera, row i being frame i of the loaded dataset. Frames come
-from lerobot's own decoder, one call per episode and camera, hence are the very bytes that it would serve.
-"""
+"""Decoded frames in files to be mapped, found by digest: `<camera>.npy` (N, 3, H, W) uint8."""
 
 import contextlib
 import errno
@@ -166,10 +162,7 @@ def frames_in_ram(source: FrameSource) -> dict[str, ImageArray]:
 
 
 def frames_on_disk(source: FrameSource, cache: Path | None) -> dict[str, Path]:
-    """Return camera -> `.npy` file of its frames, decoding them if the folder has none yet.
-
-    The folder appears by a rename; of several processes that ask at once one decodes and the others wait.
-    """
+    """Return camera -> `.npy` file of its frames, decoding them if the folder has none yet."""
     name = f"{FRAMES_FOLDER}/{dataset_digest(source)}"
     final = cached(name) if cache is None else cache / name
     paths = {camera: final / f"{camera}.npy" for camera in source.shapes}

@@ -1,8 +1,4 @@
-"""Training samples of a policy with memory: each frame with earlier ones, or the frames at which it writes.
-
-What a sample holds is what the policy is given at that frame of a rollout: the same rule chooses, shown the
-same episode from its beginning.
-"""
+"""Training samples of a policy with memory: what it is given at that frame of a rollout."""
 
 from collections.abc import Mapping
 from typing import Any  # lerobot is untyped

@@ -1,9 +1,4 @@
-"""One demonstration in two passes: the expert acts, then its actions are replayed and rendered.
-
-The first pass gives an `Attempt`, without images. `replay_attempt` is the second pass: the same seed and
-actions give the same states, which is checked, and frames are rendered. Knows nothing of files, lerobot
-or processes.
-"""
+"""One demonstration in two passes: the expert acts; its actions are replayed, checked, rendered."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
@@ -94,11 +89,7 @@ class RecordedActions:
 
 
 class NoisyEnv:
-    """A `SimEnv` whose arm is pushed: noise is added to the action, but not to the gripper's.
-
-    The standard deviation of each dimension is in units of a delta action; in a mode that is given m and rad,
-    a tenth of it.
-    """
+    """A `SimEnv` whose arm is pushed: noise in units of a delta action; a tenth of it in m and rad."""
 
     def __init__(self, env: SimEnv, std: float) -> None:
         self._env = env

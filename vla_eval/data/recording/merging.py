@@ -1,7 +1,4 @@
-"""Put the parts of a recording together as the datasets that one recording would have made.
-
-Each part has tried all seeds, since which ones are kept depends on all, and has rendered its share of shards.
-"""
+"""Put the parts of a recording together as the datasets that one recording would have made."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

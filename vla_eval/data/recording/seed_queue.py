@@ -1,8 +1,4 @@
-"""Which seeds to try, and which of the tried ones are kept. The answer does not depend on who tries them.
-
-Kept are the N lowest seeds at which the expert succeeds. A seed is tried only if fewer than N seeds below
-it are known to succeed or are being tried, so that none is left out and few are tried in vain.
-"""
+"""Which seeds to try and to keep: the N lowest at which the expert succeeds, whichever worker tries them."""
 
 from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass

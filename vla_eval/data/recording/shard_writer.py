@@ -1,8 +1,4 @@
-"""Write episodes as small LeRobotDatasets that appear whole or not at all, and put them together.
-
-lerobot loses a whole session when its process is killed, so a shard is written under another name, made
-durable and then renamed. Knows nothing of simulators: it is given frames.
-"""
+"""Write episodes as small LeRobotDatasets that appear whole or not at all, and put them together."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

@@ -26,10 +26,7 @@ MAX_SEEDS_SHOWN = 40
 
 
 def write_card(root: Path, *, license_id: str | None = None) -> str:
-    """Write card and contact sheet into a complete dataset, and return the card's text.
-
-    The licence is named as on the Hub; by default that of this project, and none for imports.
-    """
+    """Write card and contact sheet, and return the card's text; the licence is named as on the Hub."""
     dataset = open_dataset(root)
     (root / SHEET_FILE).parent.mkdir(exist_ok=True)
     (root / SHEET_FILE).write_bytes(draw_sheet(dataset))

@@ -1,7 +1,4 @@
-"""Whether demonstrations begin as episodes of an evaluation do: then a policy is tested on what it was shown.
-
-Initial states are compared, not seeds: another program's seed 1 is another episode than ours.
-"""
+"""Whether demonstrations begin as episodes of an evaluation do: states are compared, not seeds."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

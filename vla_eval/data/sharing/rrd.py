@@ -1,7 +1,4 @@
-"""Write an episode of a dataset as an `.rrd` for the rerun viewer: what a policy is trained on.
-
-Any LeRobotDataset (v3) can be shown; what it does not have is left out. docs/captures.md lists the entities.
-"""
+"""Write an episode of a dataset as an `.rrd` for the rerun viewer; entities: docs/captures.md."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

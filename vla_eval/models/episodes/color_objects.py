@@ -1,7 +1,4 @@
-"""Things that appear in demonstrations: found by their colours, given each other's colours, or erased.
-
-docs/general_memory.md, “Training”, says what a thing is, and docs/learning_the_rule.md why this is done.
-"""
+"""Things in demonstrations, by their colours: docs/general_memory.md and docs/learning_the_rule.md."""
 
 import hashlib
 import math

@@ -48,10 +48,7 @@ def recall(
     rows: Sequence[Episode],
     preprocess: Callable[[Sequence[Frame]], dict[str, Any]],
 ) -> Memory:
-    """Return the memory (B, …) after all unseen frames of the episodes in the rows.
-
-    `preprocess` makes the policy's batch of frames (T, …) or (…), one per row. `remember` may work in place.
-    """
+    """Return the memory (B, …) after all unseen frames; `preprocess` batches one frame per row."""
     singly = remembers_singly(policy)
     first = policy.begin_memory(len(rows))
     _check(first, first, len(rows), where="begin_memory")

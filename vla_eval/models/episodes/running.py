@@ -46,10 +46,7 @@ class Episode:
         return replace(self, frames=tuple(frames), unseen=tuple(unseen), earlier=earlier, step=step)
 
     def read(self, deltas: Sequence[int], *, masks_history: bool) -> Frame:
-        """Return the frame (…) that an inference reads, or the frames in time (T, …), 0 being the newest.
-
-        `masks_history` adds `FIELD_is_pad` for what lies before the episode: there is its first frame.
-        """
+        """Return the frame (…) of an inference, or frames in time (T, …), 0 being the newest."""
         if not deltas:
             return self.frames[-1]
         last = len(self.frames) - 1

@@ -1,8 +1,4 @@
-"""What our policies from scratch read of the instruction: which words are in it. Knows no network of theirs.
-
-No vocabulary and no download: a word's row in a table of learned vectors is a digest of its letters, the same
-on every machine. The order of the words is not read.
-"""
+"""Which words are in the instruction: a word's row of learned vectors is a digest of its letters."""
 
 import re
 import zlib

@@ -25,10 +25,7 @@ LEAST_SHARE = 1e-5  # of entries that count, in the mean over them
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeadSizes:
-    """What the head is made of; the defaults are Octo's.
-
-    `condition` is the readout's width; normalised actions and samples are cut to ± `max_action`.
-    """
+    """Octo's sizes; `condition` is the readout's width, samples are cut to ± `max_action`."""
 
     condition: int
     chunk: int = 4
@@ -122,10 +119,7 @@ class DiffusionHead(nn.Module):
 
     @in_float32
     def sample(self, condition_BD: Tensor, noise: Tensor) -> Tensor:
-        """Return chunks (B, chunk, action), normalised, from the readout of the newest step.
-
-        `noise` (B, T + 1, F): the start, then what each of the T steps adds; the last is not used.
-        """
+        """Return normalised chunks (B, chunk, action); `noise` (B, T + 1, F): start and each step's."""
         schedule = self.schedule()
         x = noise[:, 0]
         for index in range(self.n_steps):

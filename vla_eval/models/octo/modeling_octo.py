@@ -1,7 +1,4 @@
-"""Octo as a LeRobot policy: loss over a window of frames, chunks from the newest one.
-
-Legend of shape suffixes: B batch, W steps of the window, L tokens of the instruction, D width.
-"""
+"""Octo as a LeRobot policy. Legend: B batch, W steps, L tokens of the instruction, D width."""
 
 from collections import deque
 from collections.abc import Mapping

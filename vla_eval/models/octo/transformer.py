@@ -75,10 +75,7 @@ class StandardizedConv2d(nn.Conv2d):
 
 
 class Stem(nn.Module):
-    """Four convolutions and a patch embedding: one token per 16×16 pixels.
-
-    A goal image is stacked onto each frame's channels; there is none here, which is zeros, hence -1.
-    """
+    """One token per 16×16 pixels; there is no goal image, which is zeros, hence -1."""
 
     def __init__(self, channels: tuple[int, ...], features: int) -> None:
         super().__init__()

@@ -44,11 +44,7 @@ ALGORITHMS = {
 @PreTrainedConfig.register_subclass(TYPE)
 @dataclass
 class MikasaOfflineRLConfig(PortedConfig):
-    """An actor and a critic on one encoder of both cameras' images; no proprioception, no memory.
-
-    A training sample is a transition: images of a frame and of the next one, action, reward, and whether the
-    episode ends. Nothing is normalised by statistics: actions lie in [-1, 1].
-    """
+    """An actor and a critic on one encoder of both cameras' images; actions lie in [-1, 1]."""
 
     masks_padding: ClassVar[bool] = True  # there is none: one action per sample
     reads_state: ClassVar[bool] = False  # the encoder of the paper's baselines has none

@@ -57,10 +57,7 @@ def _chunk(network: OpenVLANetwork, tokens: Tensor) -> Tensor:
 
 
 def to_tokens(actions: Tensor, text_vocabulary: int) -> Tensor:
-    """Return the tokens (…) int64 of normalised actions (…); what is beyond [-1, 1] takes the outermost.
-
-    `text_vocabulary`: tokens of the tokenizer: the first bin is the last of them.
-    """
+    """Return the tokens (…) int64 of normalised actions (…); beyond [-1, 1]: the outermost."""
     edges = torch.linspace(-1, 1, N_BINS, dtype=torch.float64, device=actions.device)
     return text_vocabulary - torch.bucketize(actions.double().clamp(-1, 1), edges, right=True)
 

@@ -89,11 +89,7 @@ class ElmurLayer(nn.Module):
         lag: Tensor,
         biases: RelativeBiases,
     ) -> Tensor:
-        """Return tokens (B, T, W) after they have read each other and the slots (B, S, W).
-
-        `lag` (B, T, S): tokens between a token and when a slot was written. `allowed`: (1, T, T). For the
-        others, see `RelativeAttention`.
-        """
+        """Return (B, T, W) that has read the slots (B, S, W); `lag` (B, T, S) in tokens."""
         norms = self.norms
         tokens = norms["attention"](tokens + self.attention(tokens, tokens, apart, allowed, biases))
         tokens = norms["reads"](tokens + self.reads(tokens, slots, self._bias(lag)))
@@ -192,11 +188,7 @@ class Experts(nn.Module):
         self.drop = nn.Dropout(dropout)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Return (B, T, W) of tokens (B, T, W).
-
-        All experts compute all tokens: a pass whose shapes depended on the choices would give a row other
-        bits beside other rows.
-        """
+        """Return (B, T, W) of (B, T, W); all experts compute all: the same bits in any batch."""
         chosen = functional.one_hot(self.router(tokens).argmax(dim=-1), self.router.out_features)
         taken = functional.pad(chosen, (0, 1), value=1).to(tokens.dtype)
         inner = functional.silu(torch.einsum("btw,efw->btef", tokens, self.gates))

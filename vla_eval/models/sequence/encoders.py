@@ -55,10 +55,7 @@ def _shapes() -> nn.Sequential:
 
 
 class ShapesAndColors(nn.Module):
-    """Beside the maps of convolutions, some of each cell's mean colour alone, by three layers.
-
-    They find a colour in a fraction of the steps in which convolutions find it (docs/learning_the_rule.md).
-    """
+    """Beside the maps of convolutions, some of each cell's mean colour (docs/learning_the_rule.md)."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,8 +1,7 @@
-"""Cores that read an episode in segments: the tokens of the present one, and what is kept of those before.
+"""Cores that read an episode in segments.
 
-A token is answered from the segment so far and what is kept; when a segment is full, what is kept changes.
-Every pass computes a whole segment, of which what has not been seen yet is ignored: so an answer is the same
-whether the tokens come one by one or all at once, and the same bits whatever is in the other rows.
+Every pass computes a whole segment, of which what has not been seen yet is ignored: so an answer is
+the same whether tokens come one by one or all at once, and the same bits whatever the other rows are.
 """
 
 import abc

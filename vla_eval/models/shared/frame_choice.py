@@ -1,8 +1,4 @@
-"""Which earlier frames are shown beside the newest one: a rule over the frames of an episode, one by one.
-
-The same code chooses for a training sample and in a rollout. It sees images and counts frames; it knows
-neither phases nor tasks, and no torch.
-"""
+"""Which earlier frames are shown beside the newest one: one rule for training and rollouts."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace

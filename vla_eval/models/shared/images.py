@@ -142,10 +142,7 @@ def _crop_weights(start: Tensor, length: Tensor, n_px: int) -> Tensor:
 
 @in_float32
 def centre_crop(images: Tensor, area: float, *, whole: Callable[[Tensor], Tensor] = _whole_levels) -> Tensor:
-    """Return the middle of images (B, …, 3, H, W), enlarged to their size, in whole levels.
-
-    `area`: share that is left, in (0, 1]; each side is its square root. `whole` makes whole levels.
-    """
+    """Return the middle `area` (0, 1] of images (B, …, 3, H, W), enlarged, in whole levels."""
     if not 0 < area <= 1:
         raise RecipeError(f"crop area is {area}, expected a number in (0, 1].")
     side = math.sqrt(area)
@@ -169,10 +166,7 @@ def truncated_levels(images: Tensor) -> Tensor:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Augmentation:
-    """Random changes of training images; one draw per sample and camera, alike for all its frames.
-
-    Applied in this order. A value at which nothing changes switches that change off.
-    """
+    """Random changes of training images, in this order; one draw per sample and camera."""
 
     # least and largest share of the area that is kept; None: no crop
     crop_area: tuple[float, float] | None = None

@@ -58,11 +58,7 @@ def read_safetensors(source: Path) -> dict[str, Tensor]:
 
 
 def chosen_statistics(source: Path, known: Mapping[str, Any], unnorm_key: str | None) -> Any:
-    """Return the statistics of one of the datasets that a model was trained on, `known` by name.
-
-    None if there are several and none is chosen (`unnorm_key`): the checkpoint is then a base to fine-tune,
-    whose statistics are those of the new data.
-    """
+    """Return the statistics of one dataset; None if there are several and none is chosen."""
     if unnorm_key is None:
         return next(iter(known.values())) if len(known) == 1 else None
     if unnorm_key not in known:
@@ -74,10 +70,7 @@ def chosen_statistics(source: Path, known: Mapping[str, Any], unnorm_key: str | 
 
 
 def stated_gripper(source: Path, stated: str | None) -> GripperEncoding:
-    """Return how a published policy encodes the gripper, which has to be stated: none of its files says it.
-
-    Statistics cannot say it: from 0 to 1 may be from closed to open, or from open to closed.
-    """
+    """Return how a published policy encodes the gripper, which no file says: it is stated."""
     for encoding in ENCODINGS:
         if stated == encoding:
             return encoding

@@ -1,7 +1,4 @@
-"""What lerobot's configurations of our own policies share: chunks, optimizer, schedule, normalisation.
-
-Neither class is registered with lerobot: only a policy's own configuration has a name. Knows no network.
-"""
+"""What the configurations of our own policies share: chunks, optimizer, schedule, normalisation."""
 
 from collections.abc import Collection
 from dataclasses import dataclass, field

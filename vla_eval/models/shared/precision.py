@@ -1,8 +1,4 @@
-"""Which numbers are computed in which precision. Knows only torch.
-
-Under autocast all that a policy computes is in bfloat16, its images included, though its network alone is
-meant. So what prepares or reads out numbers (images, geometry, normalisation, heads) is marked `in_float32`.
-"""
+"""What prepares or reads out numbers is computed in float32, whatever autocast makes of the network."""
 
 import contextlib
 import functools

@@ -1,8 +1,4 @@
-"""Normalisation and gripper as steps of lerobot's pipelines, saved and loaded with a checkpoint.
-
-lerobot's own normaliser has neither mask nor clipping, and passes on unchanged what it has no statistics
-of; these steps raise instead.
-"""
+"""Normalisation and gripper as steps of lerobot's pipelines, with mask and clipping, which it lacks."""
 
 import dataclasses
 from collections.abc import Mapping

@@ -1,8 +1,4 @@
-"""What a policy gets of a sentence: how many of its tokens, and whether two tasks become one to it.
-
-Standard library only, so that the process that plans an evaluation can compare what its workers have found.
-Knows no tokenizer: `tokens_read` listens to those.
-"""
+"""How many tokens of a sentence a policy gets, and which tasks become one to it. Standard library."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,8 +1,4 @@
-"""Listen to what tokenizers make of sentences, wherever a policy calls one: in its processor or its network.
-
-No caller has to report: transformers' tokenizers are listened to while they are called, and code with words
-of its own calls `note`. Nothing here knows a family of policies.
-"""
+"""Listen to what tokenizers make of sentences, wherever a policy calls one: no caller has to report."""
 
 import contextlib
 import sys

@@ -44,11 +44,7 @@ class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[
 
     @torch.no_grad()
     def begin_from_base(self) -> None:
-        """Move the base's action tokens to this policy's grid; to be called once, with the base's weights.
-
-        The rows that predict the tokens move like those that embed them: else a token would be predicted by
-        its old row.
-        """
+        """Move the rows that embed and predict the base's tokens to this grid; to be called once."""
         former = self.config.former_grid()
         if former is None:
             return

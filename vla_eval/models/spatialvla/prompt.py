@@ -1,7 +1,4 @@
-"""SpatialVLA's prompt: the instruction in lower case and a newline, with the text's beginning before it.
-
-The images' tokens stand before the text; `network` puts them there. Source: prompts of the golden files.
-"""
+"""SpatialVLA's prompt, after its images' tokens. Source: prompts of the golden files."""
 
 import torch
 from torch import Tensor
@@ -19,10 +16,7 @@ def prompt_text(instruction: str) -> str:
 
 
 def finished(ids: Tensor, mask: Tensor, sizes: NetworkSizes) -> Prompts:
-    """Return tokenised prompts (B, T), padded on the right, with the beginning of text before each.
-
-    Some tokenizers put that token there by themselves, others do not; both come to the same.
-    """
+    """Return prompts (B, T), padded on the right, with the beginning of text before each."""
     keep = mask.bool()
     last = ids.gather(1, (keep.sum(dim=1, keepdim=True) - 1).clamp(min=0))[:, 0]
     if not bool((last == sizes.newline_token).all()):

@@ -1,7 +1,4 @@
-"""Build a model without memory for its weights: they have shapes and types, and get values later or never.
-
-Buffers are real: what a constructor computes, such as the frequencies of positions, is in no checkpoint.
-"""
+"""Build a model without memory for its weights; its buffers, which are in no checkpoint, are real."""
 
 import contextlib
 import threading
@@ -19,10 +16,7 @@ _patching = threading.Lock()
 
 @contextlib.contextmanager
 def empty_weights() -> Iterator[None]:
-    """Let modules that are built in this context have their parameters on torch's `meta` device.
-
-    A parameter that two modules share stays one. Not for several threads: torch's classes are patched.
-    """
+    """Let modules built in this context have parameters on `meta`; not for several threads."""
     with _patching:
         nn.Module.register_parameter = _register_empty  # type: ignore[method-assign]
         nn.Module.to = _move_what_is_real  # type: ignore[method-assign,assignment]

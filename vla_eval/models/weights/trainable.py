@@ -1,7 +1,4 @@
-"""Choose by regular expressions which parameters are trained, and check that it is just these. Knows torch.
-
-`target_modules="all-linear"` is refused: on a policy, peft then puts adapters on heads and embeddings, too.
-"""
+"""Choose by regular expressions which parameters are trained, and check that it is just these."""
 
 import re
 from collections.abc import Iterable, Sequence

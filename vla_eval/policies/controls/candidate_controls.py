@@ -1,8 +1,4 @@
-"""Controls for tasks with candidates: go to the right one or ones, to any, or to one after another.
-
-All see the true state of the world, but not the answer before the choice can be made. `cue_reader` knows of
-the answer what was in view at its own inferences, and guesses the rest as `cue_blind` does.
-"""
+"""Controls for tasks with candidates: go to the right one or ones, to any, or to one after another."""
 
 from collections.abc import Sequence
 from typing import Literal, Protocol

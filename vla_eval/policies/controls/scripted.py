@@ -1,8 +1,4 @@
-"""Controls: policies without a model, against which a learned one is measured (docs/measuring.md, audit.md).
-
-Those of an expert's arm see the true state of the world, but not the answer before the choice can be made,
-and plan a whole chunk open loop from what they see at one inference.
-"""
+"""Controls: policies without a model (docs/measuring.md, docs/audit.md)."""
 
 from collections.abc import Callable, Sequence
 from typing import Protocol, cast

@@ -1,8 +1,4 @@
-"""Controls that succeed without a memory of their own: `body_memory`, `cue_touch`, `one_frame`.
-
-They show which shortcuts a task leaves open; docs/audit.md says what each does. `body_memory` and `one_frame`
-keep nothing from one inference to the next: any policy that reads the last frame could do the same.
-"""
+"""Controls that succeed without a memory of their own; docs/audit.md says what each does."""
 
 from dataclasses import replace
 from typing import cast

@@ -26,10 +26,7 @@ def cuda_devices(device: str) -> list[torch.device]:
 
 
 def amp_dtype(device: str) -> torch.dtype:
-    """Return the half precision of `use_amp`: bfloat16, or float16 on a GPU that does not know it.
-
-    torch's own choice on any GPU is float16, whose small gradients become 0 and whose large ones overflow.
-    """
+    """Return the half precision of `use_amp`: bfloat16, whose range is float32's, or else float16."""
     kind = torch.device(device).type
     if kind == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False):
         return torch.bfloat16

@@ -1,8 +1,4 @@
-"""Which camera and which proprioception go where, checked against what the policy saw in training.
-
-The names are those of the recorder (`vla_eval.features`): the same function computes a training
-frame's state and a test frame's. Everything that does not fit is an error before the first episode.
-"""
+"""Which camera and proprioception go where, checked against what the policy saw in training."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -35,10 +31,7 @@ class InputMap:
     state: StateKind | None  # which proprioception `observation.state` is; None for a policy without any
 
     def tensors(self, observation: Observation) -> dict[str, Tensor]:
-        """Return images (3, H, W) float32 in [0, 1] and state (D,) float32, by field.
-
-        The state is computed from those of the environment, unless the observation holds it by its kind.
-        """
+        """Return images (3, H, W) float32 in [0, 1] and state (D,) float32, by field."""
         fields = {
             key: torch.from_numpy(observation.images[camera].transpose(2, 0, 1).astype(np.float32) / 255)
             for camera, key in self.cameras.items()

@@ -1,8 +1,4 @@
-"""The adapter `remote`: a policy behind a socket, asked once per inference.
-
-The chunk queue is at this end. All requests of an inference are sent before the first answer is awaited, so
-that one worker with several slots fills a batch at the server. After any error the connections are closed.
-"""
+"""The adapter `remote`: all requests of an inference are sent before the first answer is awaited."""
 
 import os
 import secrets
@@ -104,10 +100,7 @@ class RemotePolicy:
 def make_remote(
     context: PolicyContext, *, url: str, identity_sha256: str | None = None, **args: Any
 ) -> RemotePolicy:
-    """Connect to a policy server (of several with commas, the one with the fewest sessions).
-
-    A server whose digest is not `identity_sha256`, taken when the run was planned, is refused.
-    """
+    """Connect to a policy server (of several, with commas, the one with the fewest sessions)."""
     where = f"policy '{context.name}'"
     settings = remote_settings({"url": url, **args}, where=where)
     client = connect_client(split_urls(url), settings, connect_seconds=settings.connect_seconds)

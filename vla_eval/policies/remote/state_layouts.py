@@ -1,8 +1,4 @@
-"""Proprioception as servers want it: one vector of numbers with a fixed order.
-
-A layout is a name below, or the names of the environment's states with `+` between them. What the environment
-does not have is an error.
-"""
+"""Proprioception as servers want it: a layout below, or names of states with `+` between them."""
 
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
