@@ -1,7 +1,4 @@
-"""The command `mikasa-vla`: find the verb, run it, turn a user's mistake into one message.
-
-Each verb is a module with `add_arguments(parser)` and `run(args) -> int`, imported when it is needed.
-"""
+"""The command `mikasa-vla`: find the verb, run it, turn a user's mistake into one message."""
 
 import argparse
 import errno

@@ -36,10 +36,7 @@ class CaptureConfig:
         return self.video != "none" or self.rrd != "none"
 
     def films_afterwards(self, sim_backend: str) -> bool:
-        """Whether episodes run without images for it, and those that are wanted once more, to be filmed.
-
-        So it is where the outcome alone decides, and the same actions give the same episode to the bit.
-        """
+        """Whether episodes run without images, and those wanted once more: the outcome alone decides."""
         return sim_backend == "cpu" and {self.video, self.rrd} <= {"none", "failures", "successes"}
 
 

@@ -1,8 +1,4 @@
-"""A table of learned policies: which fine-tunings and evaluations it takes, and the folder of each.
-
-`docs/paper_table.md` explains them. Standard library only: `mikasa-vla finetune CONFIG --help` need not wait
-for torch.
-"""
+"""A table of learned policies (`docs/paper_table.md`): its fine-tunings, evaluations and folders."""
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace

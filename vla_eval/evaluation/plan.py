@@ -1,8 +1,4 @@
-"""From a configuration to the list of episodes: task x policy x n_action_steps x run x seed.
-
-Every mistake in a configuration that can be found without starting a simulator is found here, before the
-first episode. Knows nothing of processes or files of results.
-"""
+"""A configuration's episodes: task x policy x n_action_steps x run x seed; and its mistakes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,8 +1,4 @@
-"""The parts of a run: episodes whose policy is in the workers, then one shared policy after another.
-
-A shared policy's servers start before its first episode and end after its last. Its workers have the adapter
-`remote` and the servers' addresses; records do not show the difference.
-"""
+"""The parts of a run: episodes whose policy is in the workers, then one shared policy after another."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
@@ -66,10 +62,7 @@ def with_servers(
     logs: Path,
     stops: Callable[[], bool],
 ) -> Iterator[ReadyPhase | None]:
-    """Give a phase as workers get it; of a shared policy, while its servers are there.
-
-    `stops` is asked while servers start; true: give up, and give None.
-    """
+    """Give a phase as workers get it, with its servers; None if `stops` says so meanwhile."""
     if phase.policy is None:
         yield ReadyPhase(jobs=phase.jobs, servers=None)
         return

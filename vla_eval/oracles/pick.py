@@ -1,8 +1,4 @@
-"""Expert for ShellGamePick: grasp the chosen mug by its handle and lift it.
-
-A mug is wider than the gripper opens and stands upside down, so only the handle can be grasped. The
-fingers go to both sides of it, so the wrist is turned first.
-"""
+"""Expert for ShellGamePick: grasp the chosen mug by its handle, all else being too wide; lift it."""
 
 import math
 

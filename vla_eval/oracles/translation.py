@@ -1,8 +1,4 @@
-"""From an action of `pd_ee_delta_pose`, in which the experts plan, to any other control mode.
-
-One small step for all experts, and for datasets: the joint positions that the action aims at, and from
-there what the other mode needs to aim at the same. Knows nothing of tasks.
-"""
+"""From an action of `pd_ee_delta_pose`, in which the experts plan, to any other control mode."""
 
 import numpy as np
 from numpy.typing import NDArray

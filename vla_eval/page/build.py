@@ -38,10 +38,7 @@ class PageOptions(TypedDict, total=False):
 def build_page(
     runs: Sequence[StoredRun], *, folder: Path | None = None, **options: Unpack[PageOptions]
 ) -> str:
-    """Return the page of one or more runs; the same runs give the same bytes.
-
-    Links to captures are relative to `folder`, where the page will be; None: the current folder.
-    """
+    """Return the page of runs, the same bytes for the same runs; its links begin at `folder`."""
     published = options.get("published")
     material = gather(runs, baseline=options.get("baseline"), protocols=options.get("protocols", ()))
     chunks = rates.chunk_plots(material)

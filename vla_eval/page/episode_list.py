@@ -31,10 +31,7 @@ class _Files(NamedTuple):
 
 
 def episode_list(material: Material, folder: Path | None) -> EpisodeList:
-    """Return all episodes of the table's rows, each in the order of `FIELDS`; what is undefined is null.
-
-    Texts are numbers into lists of texts, so that 30,000 episodes fit into a file of a few megabytes.
-    """
+    """Return all episodes of the table's rows, in the order of `FIELDS`; what is undefined is null."""
     files = _files(material, folder or Path())
     errors: dict[str, int] = {}
     episodes: list[list[object]] = []

@@ -1,8 +1,4 @@
-"""Turn a matplotlib figure into SVG for use inside a page. Knows nothing of what is drawn.
-
-Colors become the page's variables, so that dark mode and printing work; definitions, whose ids two figures
-would share, are inlined.
-"""
+"""Turn a matplotlib figure into SVG for use inside a page: its colors are variables, its ids inlined."""
 
 import io
 import re

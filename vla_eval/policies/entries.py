@@ -1,8 +1,4 @@
-"""The policies of a configuration, each read once, and a policy server asked once.
-
-`NAME=A,B,C` is one of several checkpoints: the same training with different run seeds, one run each.
-`NAME:TASK=A,B,C` are those for one task; such entries of one name are one policy with a checkpoint per task.
-"""
+"""The policies of a configuration, each read once: `NAME=A,B,C` or `NAME:TASK=A,B,C` of checkpoints."""
 
 import os
 from collections.abc import Sequence

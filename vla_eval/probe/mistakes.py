@@ -82,10 +82,7 @@ def mistakes(records: Sequence[EpisodeRecord], spec: TaskSpec) -> Mistakes | Non
 
 
 def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
-    """Return how many items are kept, corrected for guessing (docs/probe.md), with the bootstrap's interval.
-
-    None if touches are not known, one item is right, or all of them are.
-    """
+    """Return how many items are kept (docs/probe.md) and the bootstrap's interval, if they are known."""
     known = [found for record in records if (found := _touches(record)) is not None]
     if not known or any(not 1 < len(one.right) < one.n_candidates for one in known):
         return None
@@ -105,10 +102,7 @@ def capacity(records: Sequence[EpisodeRecord]) -> Capacity | None:
 def _kept(
     n_touches_DE: NDArray[np.int64], means_D: NDArray[np.float64], shown: int, n: int
 ) -> NDArray[np.float64]:
-    """Return the k at which the expected number of right touches, which grows with k, is the mean.
-
-    D: draws, E: episodes.
-    """
+    """Return the k at which the expected right touches (D draws, E episodes) are the mean."""
 
     def expected(kept_D: NDArray[np.float64]) -> NDArray[np.float64]:
         kept_D1 = kept_D[:, None]

@@ -1,7 +1,4 @@
-"""When the phases of a task begin, by its arguments, and which of a policy's inferences fall into them.
-
-Knows nothing of simulators: their defaults are written down here, and a test compares.
-"""
+"""When the phases of a task begin, by its arguments, and which inferences of a policy fall into them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

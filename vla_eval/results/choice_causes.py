@@ -75,10 +75,7 @@ def report_choices(group: RowEpisodes) -> ChoiceReport | None:
 
 
 def find_habit(counts: Mapping[tuple[int, int | None], int], n_candidates: int) -> Habit | None:
-    """Test whether wrong choices prefer one index; return the one with the smallest p value.
-
-    `counts` is (target, chosen or None) -> number of episodes. None with two indices: one choice is wrong.
-    """
+    """Test whether wrong choices prefer one of three or more indices; return the one of smallest p."""
     wrong = {pair: n for pair, n in counts.items() if pair[1] is not None and pair[0] != pair[1]}
     if n_candidates < 3 or not wrong:
         return None

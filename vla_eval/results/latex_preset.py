@@ -106,10 +106,7 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
 
 
 def _best(rows: Sequence[Row]) -> set[RowKey]:
-    """Return which rows are in bold: each task's best policy, if it is above chance and unlike the next one.
-
-    Exact paired test on the same episodes, the p values of all tasks corrected together.
-    """
+    """Return each task's best policy, if above chance and, by paired tests, unlike the next one."""
     pairs = {}
     for task in dict.fromkeys(row.task for row in rows):
         learned = [row for row in rows if row.task == task and row.policy not in CONTROLS]

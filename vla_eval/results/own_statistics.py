@@ -70,10 +70,7 @@ def _mean_over_runs(group: RowEpisodes, value: Callable[[EpisodeRecord], float |
 
 
 def _mean(records: Iterable[EpisodeRecord], value: Callable[[EpisodeRecord], float | None]) -> float | None:
-    """Return the mean of a value; None if any record has none.
-
-    Excluding those would bias it: with `stop_at_success`, success_at_end is known for failures only.
-    """
+    """Return the mean of a value; None if any record has none: without those it would be biased."""
     values = [value(record) for record in records]
     known = [float(item) for item in values if item is not None]
     return math.fsum(known) / len(known) if values and len(known) == len(values) else None

@@ -79,10 +79,7 @@ class PrintedTable:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SideTable(PrintedTable):
-    """A table below the success table: a protocol's figures, published results.
-
-    Its rows are never rows of the success table, so that nothing published is mistaken for a measured value.
-    """
+    """A table below the success table: nothing published is mistaken for a measured value."""
 
     csv_columns: Sequence[str] = ()  # those that the success table has not
     # column -> value; `source` says that they are not measured episodes

@@ -81,10 +81,7 @@ class Counts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskAudit:
-    """The counts of all controls on one task of this version under one protocol, and the verdict.
-
-    The verdict names the shortcuts, which need no memory; or says that none was found.
-    """
+    """The counts of all controls on one task under one protocol, and the verdict, with the shortcuts."""
 
     task: str
     version: Positive

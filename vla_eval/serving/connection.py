@@ -1,8 +1,4 @@
-"""One client's connection: read its requests in order, send replies as they are ready.
-
-Several sessions may share a connection: a request does not wait for the reply to the one before it, and
-replies come in the order of completion. After an error the connection is closed, with its sessions.
-"""
+"""One client's connection: requests are read in order, replies are sent as they are ready."""
 
 import asyncio
 import logging

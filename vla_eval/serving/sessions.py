@@ -1,7 +1,4 @@
-"""Sessions of a server: one episode each, with its slot, its row of a pass and its unread frames.
-
-Used by the thread that reads messages alone. Knows nothing of sockets, and nothing of when an inference runs.
-"""
+"""Sessions of a server: one episode each, with its slot, its row of a pass and its unread frames."""
 
 import logging
 import time

@@ -19,10 +19,7 @@ def cache_dir() -> Path:
 
 
 def cached(name: str) -> Path:
-    """Return where something of this relative path is in the cache, or where it may be made.
-
-    Where the cache cannot be written, that is a temporary folder of this process.
-    """
+    """Return where something of this relative path is, or may be made, in the cache."""
     wanted = cache_dir() / name
     if wanted.exists() or (reason := _why_not(wanted.parent)) is None:
         return wanted

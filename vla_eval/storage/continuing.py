@@ -1,8 +1,4 @@
-"""Start or continue what has a `run.json`: the file with one more session, unless something has changed.
-
-A run may grow: its records are then those of a run that had all episodes from the start. Knows nothing of
-what else the folder holds.
-"""
+"""Start or continue what has a `run.json`, unless something has changed; a run may grow."""
 
 import itertools
 import logging

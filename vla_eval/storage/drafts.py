@@ -34,10 +34,7 @@ def whole_folder(out: Path, *, error: type[VlaEvalError]) -> Iterator[Path]:
 
 
 def draft_path(path: Path) -> Path:
-    """Return where something is written that is to appear at `path`; another one for each process.
-
-    lerobot keeps decoders open by their path: a draft must not have the path of an earlier one.
-    """
+    """Return a draft's path, new for each process: lerobot keeps decoders open by their path."""
     return path.with_name(f"{path.name}.{os.getpid()}{DRAFT_SUFFIX}")
 
 

@@ -1,8 +1,4 @@
-"""Put the shards of a run together as the run folder that one run would have left.
-
-Everything is checked before anything is written, and the new folder appears whole. The shards stay as they
-are. Knows nothing of tasks, policies or statistics.
-"""
+"""Put the shards of a run together as the run folder that one run would have left, checked before."""
 
 import itertools
 from collections.abc import Iterator, Sequence

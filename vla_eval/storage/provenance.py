@@ -44,10 +44,7 @@ def collect_environment() -> dict[str, JsonValue]:
 
 
 def checkout_state(package: Path) -> dict[str, str | None]:
-    """Return which source the package consists of, if it is imported from a git checkout.
-
-    `commit`: the full hash. `changes`: digest of what differs from it below `package`. Both None without git.
-    """
+    """Return commit (full hash) and digest of changes of a checkout; None without git."""
     unknown: dict[str, str | None] = {"commit": None, "changes": None}
     root = package.parent
     if not (root / ".git").exists():

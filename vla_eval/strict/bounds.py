@@ -1,8 +1,4 @@
-"""How large the numbers of a recipe may be: an annotation of each field. Knows nothing of what they mean.
-
-The upper bounds lie far above what anyone needs. With them a typo gives a message at the start. Without them
-it would fill the memory, or fail in every episode.
-"""
+"""How large the numbers of a recipe may be: with bounds, a typo gives a message at the start."""
 
 import functools
 import math
@@ -67,10 +63,7 @@ def _bounds_of(cls: type) -> dict[str, Bounds]:
 def check_bounds(
     recipe: object, bounds: Mapping[str, tuple[float, float]] | None = None, *, prefix: str = ""
 ) -> None:
-    """Raise `RecipeError` unless the numbers in these attributes are within (least, most), or None or a word.
-
-    The bounds are by default those that the dataclass annotates; the prefix (`finetune.`) is for messages.
-    """
+    """Raise `RecipeError` unless numbers are within (least, most), None or a word, or as annotated."""
     cls: Any = type(recipe)  # Any: mypy does not see that a class can be hashed
     for name, (least, most) in (_bounds_of(cls) if bounds is None else bounds).items():
         value = getattr(recipe, name)

@@ -113,10 +113,7 @@ def read_file(path: Path, source: Source) -> bytes:
 
 
 def loads(content: str | bytes, *, lone_surrogates: bool = False, non_finite: bool = False) -> Any:
-    """Return what JSON holds, or raise `ValueError` with what was found if it is not JSON, or not strict.
-
-    Text may hold lone surrogates, if asked: what UTF-8 cannot, as a file name of other bytes in a traceback.
-    """
+    """Return what JSON holds, or raise `ValueError`; text may hold lone surrogates, if asked."""
     text = content if isinstance(content, str) else content.decode("utf-8")
     try:
         data = (_NON_FINITE_DECODER if non_finite else _DECODER).decode(text)

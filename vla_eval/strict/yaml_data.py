@@ -34,10 +34,7 @@ _NUMBER = re.compile(
 
 
 def load_yaml(text: str, *, where: str) -> Any:  # Any: whatever the YAML holds
-    """Read YAML; no field may be given twice.
-
-    Numbers may be infinite or not a number; `decode` refuses them by their fields' names.
-    """
+    """Read YAML; no field may be given twice, and infinite numbers are left to `decode`."""
     if len(text) > MAX_CHARACTERS:
         raise RecipeError(f"{where}: found more than {MAX_CHARACTERS} characters; a recipe is a short text.")
     reader = _Reader(text)

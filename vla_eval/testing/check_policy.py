@@ -177,11 +177,7 @@ class _Runs:
         return episodes
 
     def alone(self, policy: Policy, seed: int) -> list[ActionChunk]:
-        """Return the chunks of an episode alone.
-
-        A policy that raises an error for the other sentence gets its own from then on, and `problem` says
-        what it raised.
-        """
+        """Return an episode's chunks alone; a policy that refuses a sentence gets its own."""
         own, given = self._instructions[0], self._instructions[seed % 2]
         try:
             return self.run(policy, _Episode(seed=seed))[0].chunks

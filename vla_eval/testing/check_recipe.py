@@ -30,10 +30,7 @@ def check_recipe(
     report: Callable[[str], None],
     say: Callable[[str], None] = lambda _line: None,
 ) -> list[str]:
-    """Check the policy of an evaluation, given what `task` shows; return and `report` what is met.
-
-    `say` gets what differs from the policy's training and is not a requirement, line by line.
-    """
+    """Check the policy, given what `task` shows; return and `report` what is met, `say` the rest."""
     config = EvalConfig(
         name="check",
         tasks=(task,),

@@ -1,8 +1,4 @@
-"""What stands in for files that LeRobot's configurations name, so that policies are built without a network.
-
-Tokenizers have a few hundred tokens; those of a policy that has to name whatever token its network predicts
-have the published number. A row of `models.families` says which function is whose.
-"""
+"""What stands in for files that LeRobot's configurations name: policies are built without a network."""
 
 from collections.abc import Mapping
 from pathlib import Path

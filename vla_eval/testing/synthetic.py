@@ -1,8 +1,4 @@
-"""A synthetic dataset in our format: for tests, and to measure loaders without recorded data.
-
-Images drift like those of a moving camera, so the codec has realistic work. All numbers are random. Nothing
-was simulated and there is no manifest, so it is not a complete dataset.
-"""
+"""A synthetic dataset in our format, of random numbers: for tests, and to measure loaders."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,8 +1,4 @@
-"""A table of learned policies with tiny random models, on the fake simulator, in minutes.
-
-The results of the rows say nothing about the models after which they are named. A row shows that recording,
-fine-tuning, loading and evaluation work together.
-"""
+"""A table of learned policies with tiny random models, on the fake simulator, in minutes."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,8 +1,7 @@
-"""Which samples a training step gets: a function of run seed, step and process, wherever the training began.
+"""Which samples a training step gets: a function of run seed, step and process.
 
-The order is that of lerobot's `EpisodeAwareSampler` (a permutation for each epoch), shared among processes as
-accelerate's `BatchSamplerShard` does. Neither can begin in the middle: accelerate sets the sampler's epoch
-back to 0, and completes an epoch's last batches with samples from wherever the sampler began.
+The order is that of lerobot's `EpisodeAwareSampler`, shared as accelerate's `BatchSamplerShard` does;
+neither can begin in the middle of an epoch.
 """
 
 import itertools

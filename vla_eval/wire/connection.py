@@ -1,8 +1,4 @@
-"""One connection to a policy server: whole messages out and in, and what can go wrong with that.
-
-Knows nothing of what the messages mean. After any error the connection is closed for good: what would come
-next could be taken for something that it is not.
-"""
+"""One connection to a policy server: whole messages out and in; closed for good after any error."""
 
 import logging
 import time

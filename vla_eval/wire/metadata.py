@@ -1,7 +1,4 @@
-"""Server metadata: a policy server's first message, and what it permits the client to send.
-
-A server of openpi's says little or nothing: then a value is unknown, which is not the same as none.
-"""
+"""Server metadata, a policy server's first message: what it does not say is unknown, not none."""
 
 import hashlib
 from collections.abc import Callable, Mapping

@@ -1,8 +1,4 @@
-"""The backend that has no worker processes: jobs are done one after another in this process.
-
-For debuggers and for what a policy prints. Nothing is ended when it takes too long, and what a policy changes
-in the process stays.
-"""
+"""The backend without worker processes, for debuggers: jobs are done one after another in this one."""
 
 from collections.abc import Hashable, Iterator, Sequence
 from dataclasses import dataclass

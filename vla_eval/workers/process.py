@@ -1,8 +1,4 @@
-"""One worker process, from the side of its parent: give it jobs, read its answers, end it. Decides nothing.
-
-Calls that may block run in a thread: starting a process by a server that may have been stopped, giving a
-job to a process that does not read, waiting for the previous process.
-"""
+"""One worker process, from the side of its parent: give it jobs, read its answers, end it."""
 
 import contextlib
 import functools

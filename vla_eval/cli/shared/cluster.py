@@ -17,10 +17,7 @@ def backend_of(
     needs: Callable[[], tuple[Needed, ...]] = tuple,
     notes_kinds: bool = True,
 ) -> Iterator[Backend]:
-    """Give what `--cluster` names, whose machines must have the files of `needs`; without it, this machine.
-
-    Where results do not note the kind of machine (`notes_kinds`), there must be one kind.
-    """
+    """Give what `--cluster` names, whose machines must have the files of `needs`; else this machine."""
     if args.cluster is None:
         yield LOCAL
         return

@@ -39,10 +39,7 @@ def evaluate_one(
 def evaluate_each(
     runs: Iterable[tuple[Path, EvalConfig]], args: argparse.Namespace, *, backend: Backend
 ) -> Evaluations:
-    """Run or resume each evaluation, (run folder, configuration); a signal stops it and those after it.
-
-    Of `args`: `--shard`, `--allow-environment-change` and `--json-progress`.
-    """
+    """Run or resume each evaluation, (run folder, configuration), until a signal stops it."""
     n_errors = 0
     with progress.stop_on_signals() as stop:
 
@@ -62,10 +59,7 @@ def evaluate_each(
 def in_turn(
     runs: Iterable[tuple[Path, EvalConfig]], run: Callable[[Path, EvalConfig], bool | None]
 ) -> bool | None:
-    """Run each until one returns that it was stopped, which is returned.
-
-    One that another process is writing comes last, so that several processes share the work.
-    """
+    """Run each until one is stopped; one that another process is writing comes last."""
     put_off: list[tuple[Path, EvalConfig]] = []
     for out, config in itertools.chain(runs, put_off):  # which grows meanwhile
         try:

@@ -1,7 +1,4 @@
-"""Show how many episodes are done: a bar on a terminal, elsewhere a line from time to time.
-
-The bar is tqdm's; in a file, tqdm would write a bar per second, and rich nothing until the end.
-"""
+"""Show how many episodes are done: tqdm's bar on a terminal, elsewhere a line from time to time."""
 
 import sys
 import time

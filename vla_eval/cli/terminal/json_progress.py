@@ -1,7 +1,4 @@
-"""`--json-progress FD`: progress for other programs, one JSON object per line of a file descriptor.
-
-`docs/evaluation.md` has the schema. What is not known is null, never 0. Knows nothing of bars.
-"""
+"""`--json-progress FD`: JSON objects, one per line (`docs/evaluation.md`); what is not known is null."""
 
 import json
 import logging

@@ -1,7 +1,4 @@
-"""Fit text to the terminal that it is printed on. In a file or a pipe, a paragraph stays one line.
-
-Not by rich: it breaks commands, and takes a third of the time in which `--help` has to start.
-"""
+"""Fit text to the terminal; not by rich, which breaks commands and slows down `--help`."""
 
 import os
 import re
@@ -38,10 +35,7 @@ def message_width(stream: TextIO) -> int | None:
 
 
 def folded(text: str, width: int) -> str:
-    """Return a message whose lines have at most so many characters, but for commands and long words.
-
-    Lines that begin with a blank (code, a bar) stay as they are.
-    """
+    """Return lines of at most so many characters, but for commands, code and long words."""
     return "".join(_folded_line(line, width) for line in text.splitlines(keepends=True))
 
 

@@ -1,4 +1,4 @@
-"""Which seeds to try and to keep: the N lowest at which the expert succeeds, whichever worker tries them."""
+"""Which seeds to try and keep: the N lowest at which the expert succeeds, whatever worker tries them."""
 
 from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass

@@ -130,7 +130,10 @@ def _first(steps: Tensor, is_there: Tensor) -> Tensor:
 
 
 def _shown(kept: Tensor, begins: Tensor, late_steps: int) -> tuple[Tensor, Tensor]:
-    """Return (B, T) the steps that are shown, in order, and their weights; padding has none."""
+    """Return (B, T) the steps that are shown, in order, and their weights; padding has none.
+
+    A decision is shown up to `late_steps` times again with the weight of one: there is one frame of each.
+    """
     times = kept.long()
     if late_steps:
         times = times + torch.randint(0, late_steps + 1, times.shape, device=times.device) * (kept & begins)

@@ -119,7 +119,10 @@ class DiffusionHead(nn.Module):
 
     @in_float32
     def sample(self, condition_BD: Tensor, noise: Tensor) -> Tensor:
-        """Return normalised chunks (B, chunk, action); `noise` (B, T + 1, F): start and each step's."""
+        """Return chunks (B, chunk, action), normalised, from the readout of the newest step.
+
+        `noise` (B, T + 1, F): the start, then what each of the T steps adds; the last is not used.
+        """
         schedule = self.schedule()
         x = noise[:, 0]
         for index in range(self.n_steps):

@@ -1,4 +1,9 @@
-"""Read a published OpenVLA, or what the OFT scripts have saved. No code of the checkpoint is run."""
+"""Read a published OpenVLA, or what the OFT scripts have saved, to make a LeRobot checkpoint of it.
+
+No code of the checkpoint is run. Weights are safetensors; the heads of OFT lie beside them as pickled
+tensors (`action_head--50000_checkpoint.pt`), which are read only if that is allowed by name, and then by
+torch's reader that builds nothing but tensors.
+"""
 
 import dataclasses
 import re

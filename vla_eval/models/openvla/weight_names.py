@@ -1,4 +1,8 @@
-"""Names and layouts of weights: those of `openvla/openvla-7b` and OFT to ours, exactly."""
+"""Names and layouts of weights: those of `openvla/openvla-7b` and OFT to ours, exactly.
+
+The original's vision encoders are timm models: one matrix for query, key and value, positions without a row
+for the class token. What it has and never uses (last blocks, final norms, SigLIP's pooling) is left out.
+"""
 
 from collections.abc import Iterable, Mapping
 

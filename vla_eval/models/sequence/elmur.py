@@ -89,7 +89,7 @@ class ElmurLayer(nn.Module):
         lag: Tensor,
         biases: RelativeBiases,
     ) -> Tensor:
-        """Return (B, T, W) that has read the slots (B, S, W); `lag` (B, T, S) in tokens."""
+        """Return (B, T, W) that has read slots (B, S, W); `lag` (B, T, S), `allowed` (1, T, T)."""
         norms = self.norms
         tokens = norms["attention"](tokens + self.attention(tokens, tokens, apart, allowed, biases))
         tokens = norms["reads"](tokens + self.reads(tokens, slots, self._bias(lag)))

@@ -112,7 +112,11 @@ class SequenceNetwork(nn.Module):
 
     @in_float32
     def read(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
-        """Return the core's answers (B, T, width), and the memory after the last step."""
+        """Return the core's answers (B, T, width) to observations, and the memory after the last step.
+
+        The return to go is the target at every step: no reward is known. The action, where it is read, is
+        the one that the policy itself decides on at the step.
+        """
         if not self.config.reads_returns:
             answers, kept = self.core(tokens, memory[:-1])
             return answers, (*kept, answers[:, -1])
