@@ -1,4 +1,8 @@
-"""Expert for InterceptGrab: fly over the ball at its speed along y, descend around it, close, stop."""
+"""Expert for InterceptGrab: fly over the ball at its own speed, descend around it, close, stop.
+
+The fingers are aligned along y, and the ball rolls along y. A hand at rest would block it. A hand that
+moves with the ball does not: one finger is in front of the ball and one behind.
+"""
 
 from dataclasses import dataclass, replace
 

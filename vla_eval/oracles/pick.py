@@ -1,4 +1,8 @@
-"""Expert for ShellGamePick: grasp the chosen mug by its handle, all else being too wide; lift it."""
+"""Expert for ShellGamePick: grasp the chosen mug by its handle and lift it.
+
+A mug is wider than the gripper opens and stands upside down, so only the handle can be grasped. The
+fingers go to both sides of it, so the wrist is turned first.
+"""
 
 import math
 

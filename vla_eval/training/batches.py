@@ -1,7 +1,8 @@
-"""Which samples a training step gets: a function of run seed, step and process.
+"""Which samples a training step gets: a function of run seed, step and process, wherever the training began.
 
-The order is that of lerobot's `EpisodeAwareSampler`, shared as accelerate's `BatchSamplerShard` does;
-neither can begin in the middle of an epoch.
+The order is that of lerobot's `EpisodeAwareSampler` (a permutation for each epoch), shared among processes as
+accelerate's `BatchSamplerShard` does. Neither can begin in the middle: accelerate sets the sampler's epoch
+back to 0, and completes an epoch's last batches with samples from wherever the sampler began.
 """
 
 import itertools

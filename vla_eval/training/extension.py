@@ -1,4 +1,8 @@
-"""Whether a training may have another number of steps: only the schedule may depend on it."""
+"""Whether a training may have another number of steps than it was started with. Knows no models.
+
+Of all that a step does, the learning rate alone may depend on the number of steps that follow: lerobot hands
+it to the schedule and to nothing else.
+"""
 
 import json
 import shlex

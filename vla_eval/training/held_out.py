@@ -1,4 +1,8 @@
-"""Evaluate checkpoints on held-out seeds while the training waits, by generators of its own."""
+"""Evaluate checkpoints during training, on seeds that are used for nothing else.
+
+It runs while the training waits, since both need the same device, and draws from none of its generators. A
+training that was killed during one finishes it first and then resumes.
+"""
 
 import functools
 from collections.abc import Callable, Iterable, Mapping
@@ -197,7 +201,10 @@ def asked_warnings(facts: TrainingFacts, task: str | None, *, policy: str) -> li
 
 
 def shared_seeds_warning(dataset: "OpenDataset") -> str | None:
-    """Return a warning if demonstrations are of seeds that tables are made from; None if none is."""
+    """Return a warning if demonstrations are of seeds that tables are made from; None if none is.
+
+    Recording refuses such seeds; a dataset from elsewhere, or of an earlier version, may have them.
+    """
     shown = sorted(dataset.seeds_tried & set(EVALUATION_SEEDS))
     if not shown:
         return None

@@ -91,7 +91,11 @@ def begin(
 
 
 def _leave_helpers() -> None:
-    """Close the pipes to server and resource tracker: what a policy writes there ends both."""
+    """Close the pipes to the server and to multiprocessing's resource tracker.
+
+    Both end with a traceback if a policy writes into what it has inherited. The tracker is started again if
+    the worker needs one.
+    """
     owners: tuple[tuple[Any, str], ...] = (  # there are no public names
         (forkserver._forkserver, "_forkserver_alive_fd"),
         (resource_tracker._resource_tracker, "_fd"),
@@ -116,7 +120,10 @@ def server_is_stopped() -> bool:
 
 
 def end_server() -> None:
-    """Kill the server that workers are forked from, which does not answer; workers stay as they are."""
+    """Kill the process that workers are forked from: it does not answer. The next worker starts another one.
+
+    Workers are not touched; the kernel keeps the dead process until `multiprocessing` sees that it is gone.
+    """
     pid = _server_pid()
     if pid is not None:
         with contextlib.suppress(ProcessLookupError, ChildProcessError):
@@ -155,7 +162,10 @@ def child_context() -> SpawnContext:
 
 
 def start_by_lasting_thread(start: Callable[[], None]) -> None:
-    """Start a process by a thread that lasts: when it ends, the kernel counts the parent as gone."""
+    """Start a process by a thread that lives as long as this process, and wait for that.
+
+    The kernel counts a process's parent as gone when the thread that started it has ended.
+    """
     global _starter
     with _environment_lock:
         if _starter is None or not _starter.is_alive():  # as in a fork of this process

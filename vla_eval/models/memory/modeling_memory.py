@@ -111,7 +111,11 @@ class MikasaMemoryPolicy(EpisodePolicy):
 
 
 def foreseen_alone(answer: Answer, *, holds_by_zero: bool = True) -> Tensor:
-    """Return (B, chunk, action), held from the first guess on (docs/positive_control.md)."""
+    """Return the actions (B, chunk, action) of an answer, held from the first that is a guess.
+
+    A guess is an action whose error is expected to be larger by `UNFORESEEN` than that of the chunk's first
+    (docs/positive_control.md). Held: no motion (zeros, or the last action foreseen), the gripper as it was.
+    """
     doubts = answer.doubts.sqrt()
     foreseen = (doubts <= doubts[:, :1] + UNFORESEEN).long().cumprod(dim=1)
     last = (foreseen.sum(dim=1) - 1)[:, None, None]

@@ -89,7 +89,11 @@ class ElmurLayer(nn.Module):
         lag: Tensor,
         biases: RelativeBiases,
     ) -> Tensor:
-        """Return (B, T, W) that has read slots (B, S, W); `lag` (B, T, S), `allowed` (1, T, T)."""
+        """Return tokens (B, T, W) after they have read each other and the slots (B, S, W).
+
+        `lag` (B, T, S): tokens between a token and when a slot was written. `allowed`: (1, T, T). For the
+        others, see `RelativeAttention`.
+        """
         norms = self.norms
         tokens = norms["attention"](tokens + self.attention(tokens, tokens, apart, allowed, biases))
         tokens = norms["reads"](tokens + self.reads(tokens, slots, self._bias(lag)))
@@ -188,7 +192,11 @@ class Experts(nn.Module):
         self.drop = nn.Dropout(dropout)
 
     def forward(self, tokens: Tensor) -> Tensor:
-        """Return (B, T, W) of (B, T, W); all experts compute all: the same bits in any batch."""
+        """Return (B, T, W) of tokens (B, T, W).
+
+        All experts compute all tokens: a pass whose shapes depended on the choices would give a row other
+        bits beside other rows.
+        """
         chosen = functional.one_hot(self.router(tokens).argmax(dim=-1), self.router.out_features)
         taken = functional.pad(chosen, (0, 1), value=1).to(tokens.dtype)
         inner = functional.silu(torch.einsum("btw,efw->btef", tokens, self.gates))

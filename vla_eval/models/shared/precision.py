@@ -1,4 +1,8 @@
-"""What prepares or reads out numbers is computed in float32, whatever autocast makes of the network."""
+"""Which numbers are computed in which precision. Knows only torch.
+
+Under autocast all that a policy computes is in bfloat16, its images included, though its network alone is
+meant. So what prepares or reads out numbers (images, geometry, normalisation, heads) is marked `in_float32`.
+"""
 
 import contextlib
 import functools

@@ -1,4 +1,8 @@
-"""A section of a JSON file that describes a model: a field that stands in no list is an error."""
+"""One section of a JSON file that describes a model: which fields are compared, and which say nothing.
+
+A field that says something else than what is implemented is an error; so is one that stands in no list, for
+it may change what the model does. A missing field means what the original's code makes of it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

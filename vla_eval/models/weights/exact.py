@@ -1,4 +1,8 @@
-"""Put weights into a model, exactly; lerobot's and torch's own loaders let misfits pass unsaid."""
+"""Put weights into a model, exactly: same keys, shapes, types and, afterwards, values. Knows only torch.
+
+Ours, since lerobot loads with `strict=False`, and torch's own strictness casts types without a word.
+One tensor after the other: a model is not in memory twice while it is loaded.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any  # lerobot's policies are untyped

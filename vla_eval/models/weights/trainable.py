@@ -1,4 +1,7 @@
-"""Choose by regular expressions which parameters are trained, and check that it is just these."""
+"""Choose by regular expressions which parameters are trained, and check that it is just these. Knows torch.
+
+`target_modules="all-linear"` is refused: on a policy, peft then puts adapters on heads and embeddings, too.
+"""
 
 import re
 from collections.abc import Iterable, Sequence
