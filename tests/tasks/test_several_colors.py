@@ -184,7 +184,7 @@ def test_bunches_sequences_and_chains_of_a_seed_differ() -> None:
     ("kwargs", "message"),
     [
         ({"n_shown": 10}, "n_shown=10: expected 1 to 9"),
-        ({"n_items": 6, "n_shown": 7}, "n_shown=7: expected 1 to 6"),
+        ({"n_items": 6, "n_shown": 7}, "n_shown=7: expected at most n_items=6"),
         ({"n_items": 10}, "n_items=10: expected 2 to 9"),
         ({"gap_steps": 2}, "shown together"),
         ({"dwell_steps": 0}, "dwell_steps=0: expected 1"),
