@@ -75,11 +75,11 @@ class _Joints:
             joint.set_drive_target(target)
 
 
-def _scaling(controller: Any) -> Callable[[FloatArray], FloatArray]:
-    """Return what turns an action into the controller's units."""
+def _scaling(controller: Any, part: slice = slice(None)) -> Callable[[FloatArray], FloatArray]:
+    """Return what turns this part of an action into the controller's units."""
     if not controller._normalize_action:
         return lambda action: action
-    low, high = controller.action_space_low.numpy(), controller.action_space_high.numpy()
+    low, high = controller.action_space_low[part].numpy(), controller.action_space_high[part].numpy()
     middle, half = 0.5 * (high + low), 0.5 * (high - low)
     return lambda action: middle + half * np.minimum(np.maximum(action, -ONE), ONE)
 
@@ -146,12 +146,11 @@ def _pose_drive(controller: Any) -> Drive:
 def _pose_scaling(controller: Any) -> Callable[[FloatArray], tuple[FloatArray, Quaternion | None]]:
     """Return what turns an action into a translation and, where it has one, a rotation."""
     if not isinstance(controller, PDEEPoseController):
-        whole = _scaling(controller)
-        return lambda action: (whole(action), None)
+        translation = _scaling(controller)
+        return lambda action: (translation(action), None)
     if not controller._normalize_action:
         return lambda action: (action[:3], _from_euler(action[3:]))
-    low, high = controller.action_space_low[:3].numpy(), controller.action_space_high[:3].numpy()
-    middle, half = 0.5 * (high + low), 0.5 * (high - low)
+    translation = _scaling(controller, slice(3))
     unit_rad = np.float32(controller.config.rot_lower)
 
     def scaled(action: FloatArray) -> tuple[FloatArray, Quaternion]:
@@ -159,7 +158,7 @@ def _pose_scaling(controller: Any) -> Callable[[FloatArray], tuple[FloatArray, Q
         norm = torch.linalg.norm(torch.from_numpy(turn)[None], dim=1).numpy()[0]
         if norm > 1:
             turn = turn * (ONE / norm)
-        return middle + half * np.minimum(np.maximum(action[:3], -ONE), ONE), _from_euler(turn * unit_rad)
+        return translation(action[:3]), _from_euler(turn * unit_rad)
 
     return scaled
 
