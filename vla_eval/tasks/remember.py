@@ -16,14 +16,14 @@ from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.memory_env import nearness
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere
+from vla_eval.tasks.objects.item_names import MIXED_SHAPE_NAMES, N_MIXED_COLORS
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
 from vla_eval.tasks.objects.layout import Plane, jittered_apart, slot_centres_m
 from vla_eval.tasks.objects.limits import CubeHalfSize, ItemCount, MixedColorCount, MixedShapeCount, Positive
 from vla_eval.tasks.tensors_out import Info
 
 SHAPE_COLOR = COLORS[2]  # blue, as in the official RememberShape
-MIXED_SHAPES = ("cube", "sphere", "t_shape", "cross", "torus")
-MIXED_COLORS = COLORS[:3]
+MIXED_COLORS = COLORS[:N_MIXED_COLORS]
 
 
 class RememberEnv(ItemChoiceEnv):
@@ -160,7 +160,9 @@ class RememberShapeAndColorEnv(RememberEnv):
                 )
             n_shapes, n_colors = 2, 3
         self.n_shapes, self.n_colors = n_shapes, n_colors
-        items = [Item(SHAPES[s], color) for s in MIXED_SHAPES[:n_shapes] for color in MIXED_COLORS[:n_colors]]
+        items = [
+            Item(SHAPES[s], color) for s in MIXED_SHAPE_NAMES[:n_shapes] for color in MIXED_COLORS[:n_colors]
+        ]
         super().__init__(*args, items=tuple(items), **kwargs)
 
     def stream_key(self) -> tuple[int, ...]:

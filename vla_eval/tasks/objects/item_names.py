@@ -17,6 +17,9 @@ COLOR_RGB = {
 }
 COLOR_NAMES = tuple(COLOR_RGB)
 SHAPE_NAMES = ("cube", "sphere", "cylinder", "cross", "torus", "star", "pyramid", "t_shape", "crescent")
+# Shapes and colours, the first ones, of tasks whose items differ in both.
+MIXED_SHAPE_NAMES = ("cube", "sphere", "t_shape", "cross", "torus")
+N_MIXED_COLORS = 3
 _NAMES = {"RememberColor": COLOR_NAMES, "RememberShape": SHAPE_NAMES}
 
 

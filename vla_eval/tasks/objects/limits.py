@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 from vla_eval.errors import TaskArgumentError
 from vla_eval.strict.bounds import MAX_STEPS
-from vla_eval.tasks.objects.item_names import COLOR_NAMES
+from vla_eval.tasks.objects.item_names import COLOR_NAMES, MIXED_SHAPE_NAMES, N_MIXED_COLORS
 
 
 class Limits(NamedTuple):
@@ -37,12 +37,11 @@ Positive = Annotated[float, Limits(0, above=True)]
 NotNegative = Annotated[int, Limits(0)]
 ItemCount = Annotated[int, Limits(2, len(COLOR_NAMES))]  # one per colour, or per shape: there are as many
 ShownCount = Annotated[int, Limits(1, len(COLOR_NAMES))]
-MixedShapeCount = Annotated[int, Limits(1, 5)]
-MixedColorCount = Annotated[int, Limits(1, 3)]
+MixedShapeCount = Annotated[int, Limits(1, len(MIXED_SHAPE_NAMES))]
+MixedColorCount = Annotated[int, Limits(1, N_MIXED_COLORS)]
 DwellSteps = Annotated[int, Limits(1, MAX_STEPS)]
-CubeHalfSize = Annotated[
-    float, Limits(0.01, 0.03)
-]  # neighbours may lie 6 cm apart: larger ones would overlap
+# Neighbours may lie 6 cm apart: larger ones would overlap.
+CubeHalfSize = Annotated[float, Limits(0.01, 0.03)]
 CarryHeight = Annotated[float, Limits(0, 0.5)]  # 0: need not be lifted; the most is what the arm reaches
 LiftHeight = Annotated[float, Limits(0, 0.4, above=True)]
 
