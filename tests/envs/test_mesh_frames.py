@@ -1,4 +1,4 @@
-"""What is left out of a picture because no view shows it: the same pixels as with everything."""
+"""Leaving out what no view shows changes no pixel."""
 
 from typing import Literal
 
@@ -67,7 +67,7 @@ def test_the_wrist_camera_s_own_scene_shows_what_the_whole_scene_shows(
             for camera in CAMERAS:
                 np.testing.assert_array_equal(seen[camera], whole[camera][0])
     env.close()
-    assert n_apart > 12, "nearly all pictures were drawn with the whole scene"
+    assert n_apart > 12, "most images were drawn with the whole scene"
 
 
 def test_the_arm_is_drawn_where_it_may_be_seen() -> None:

@@ -87,9 +87,8 @@ class WristView:
         view = (self._mount.pose * self._local).inv()
         poses = np.stack([(view * entity.pose).to_transformation_matrix() for entity in links.values()])
         corners = np.stack([self._corners[name] for name in links])
-        x, y, z = np.moveaxis(corners @ poses.transpose(0, 2, 1), 2, 0)[
-            :3
-        ]  # ahead, left, up; (links, corners)
+        seen_from_camera = np.moveaxis(corners @ poses.transpose(0, 2, 1), 2, 0)
+        x, y, z, _ = seen_from_camera  # ahead, left, up; each (links, corners)
         edge = np.maximum(x, 0) * self._tan + MARGIN_M
         outside = [x < -MARGIN_M, y > edge, y < -edge, z > edge, z < -edge]
         return not np.stack(outside).all(axis=2).any(axis=0).all()
