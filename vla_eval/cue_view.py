@@ -66,9 +66,14 @@ def cue_locator(env: SimEnv, settings: CueViewSettings, cameras: Sequence[str]) 
         return lambda _slot: {}
     if isinstance(env, CueLocator):
         return env.cue_boxes
-    raise SpecMismatchError(
-        f"cue_view={settings.kind}: {env.spec.task}: this environment cannot tell where in its images the "
-        "cue is. Use another one, or leave this view out."
+    raise no_cue_locator(settings.kind, env.spec.task)
+
+
+def no_cue_locator(kind: CueViewKind, task: str) -> SpecMismatchError:
+    """Return the error for an environment in which the cue cannot be hidden."""
+    return SpecMismatchError(
+        f"cue_view={kind}: {task}: this environment cannot tell where in its images the cue is. Use another "
+        "one, or leave this view out."
     )
 
 

@@ -14,7 +14,7 @@ from tests.training import tiny_trainings
 from vla_eval.api import probing
 from vla_eval.cli.main import main
 from vla_eval.core import ActionChunk
-from vla_eval.errors import FolderInUseError, VlaEvalError
+from vla_eval.errors import FolderInUseError, TaskArgumentError, VlaEvalError
 from vla_eval.specs import PolicySpec
 from vla_eval.training.finetune import finetune
 
@@ -49,6 +49,24 @@ def test_finetune_and_load_dataset_do_what_the_verbs_do(
     dataset = vla_eval.load_dataset(recorded)
     assert len(dataset.columns["action"]) == dataset.facts.n_frames
     assert vla_eval.load_dataset(recorded.parent).root == recorded
+
+
+def test_every_function_refuses_arguments_that_do_not_go_together_before_anything_starts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    task, env = "SeqOfColors3-v0", {"n_shown": 5, "n_items": 4}
+    calls: dict[str, Any] = {
+        "evaluate": lambda: vla_eval.evaluate(policy="oracle", tasks=task, env=env),
+        "run_probe": lambda: vla_eval.run_probe(policy="oracle", tasks=task, probes="swap", env=env),
+        "record": lambda: vla_eval.record(tasks=task, episodes=1, env=env),
+        "make_env": lambda: vla_eval.make_env(task, **env),
+    }
+    for name, call in calls.items():
+        with pytest.raises(TaskArgumentError) as found:
+            call()
+        assert str(found.value) == f"{task}: n_shown=5: expected at most n_items=4.", name
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_policy_of_a_notebook_is_probed_as_a_named_one_is(tmp_path: Path) -> None:

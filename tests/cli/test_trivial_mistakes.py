@@ -11,7 +11,7 @@ from tests.cli.every_verb import COMMANDS, environment_of, verb_of
 
 TASK = "RememberColor3-v0"
 FAKE = "--set simulator=fake"
-# What a task's arguments cannot be together; of those a typo, a wrong type, and an end before the choice.
+# A typo, a wrong type, and what a task's arguments cannot be together (`test_arguments_together`).
 WRONG_ENV = {
     "--set env.delay_step=20": "Did you mean 'delay_steps'?",
     "--set env.delay_steps=long": "delay_steps",
@@ -35,6 +35,7 @@ MISTAKES: dict[str, dict[str, str]] = {
         f"eval --task {TASK} --policy empty {FAKE}": "empty",
         f"eval --task {TASK} --policy oracle --protocol paper_vl {FAKE}": "Did you mean 'paper_vla'",
         f"eval --task {TASK} --policy smolvla {FAKE}": "mikasa-vla checkpoint fetch smolvla_base",
+        f"eval --task {TASK} --policy oracle --set env.swap_cue=7": "expected 0 to 2, 0 for no swap",
         f"eval --task {TASK} --policy act --dry-run": "has no weights",
         f"eval --task {TASK} --policy memory_color3 --n-action-steps 4 16 --dry-run": "chunks of 8 actions",
         **{f"eval --task {TASK} --policy oracle --dry-run {env}": said for env, said in WRONG_ENV.items()},
@@ -66,6 +67,7 @@ MISTAKES: dict[str, dict[str, str]] = {
     "record": {
         "record nowhere": "nowhere",
         f"record --task RememberColour3-v0 {FAKE}": "RememberColour3-v0",
+        f"record --task {TASK} --set env.swap_cue=7": "expected 0 to 2, 0 for no swap",
         **{f"record --task {TASK} {env}": said for env, said in WRONG_ENV.items()},
     },
     "replay": {"replay data/nowhere": "data/nowhere", "replay empty": "empty"},

@@ -10,7 +10,13 @@ from tests.config.eval_configs import config
 from tests.evaluation.resolved import fingerprint, make_plan, results_config
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import to_data
-from vla_eval.errors import MissingInstructionError, RecipeError, UnknownNameError
+from vla_eval.errors import (
+    MissingInstructionError,
+    RecipeError,
+    SpecMismatchError,
+    TaskArgumentError,
+    UnknownNameError,
+)
 from vla_eval.evaluation.job_queue import JobQueue
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import TASKS
@@ -68,6 +74,20 @@ class TestPlan:
 
         with pytest.raises(RecipeError, match=r"the file is called 'a\\\\b'.*Rename the file"):
             make_plan(config(policies=[str(recipe)]))
+
+    def test_a_change_that_no_episode_of_the_task_can_have_is_refused(self) -> None:
+        for fields, message in (
+            ({"tasks": ["InterceptMedium-v0"], "cue_view": "hidden"}, "this task has no cue phase"),
+            ({"tasks": ["InterceptMedium-v0"], "cue_view": "first_frame"}, "this task has no cue phase"),
+            ({"env": {"cue_steps": 0, "delay_steps": 0}, "cue_view": "hidden"}, "has no cue phase"),
+            ({"reset_policy_at_step": 60}, "the episode ends after 60 steps: nothing would be reset"),
+        ):
+            with pytest.raises(TaskArgumentError, match=message):
+                make_plan(config(**fields))
+        official = {"tasks": ["mikasa_vla/RememberColor3-VLA-v0"], "cue_view": "hidden"}
+        with pytest.raises(SpecMismatchError, match="cannot tell where in its images the cue is"):
+            make_plan(config(**official))
+        make_plan(config(reset_policy_at_step=59, cue_view="hidden"))
 
     def test_an_instruction_in_env_is_refused_because_no_policy_would_see_it(self) -> None:
         with pytest.raises(RecipeError, match="prompt_set"):

@@ -16,6 +16,7 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
+from vla_eval.envs.official_settings import check_official
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
@@ -42,7 +43,8 @@ RULES = {
     **{"swap_cue": 0, "show_cue": True, "freeze_until_choice": False, "strict_choice": False},
     **{"move_in_delay": False, "distract_steps": 0, "cue_after_steps": 0},
 }
-CHOICE_DEFAULTS = {"cue_steps": 5, "delay_steps": 5, **RULES}
+PHASES = ("cue_steps", "delay_steps")  # not drawn from a range here
+CHOICE_DEFAULTS = {**dict.fromkeys(PHASES, 5), **RULES}
 SEVERAL_DEFAULTS = {**CHOICE_DEFAULTS, "n_shown": 3, "swap_order": 0, "shuffle_cue": False}
 BALL_DEFAULTS = {"velocity_range_m_s": (0.5, 0.75), "swap_cue": 0}
 
@@ -70,15 +72,17 @@ class FakeEnv:
 
     def __init__(self, settings: EnvSettings) -> None:
         task = task_spec(settings.task)
-        check_arguments(task, settings.kwargs, TASKS.values())
         defaults = _defaults(task)
-        known = ("horizon_steps", CONTROL_MODE, IMAGE_SIZE, *defaults)
-        check_names("argument", settings.kwargs, known, where=task.id)
+        if task.is_official:
+            check_official(settings, task)
+        else:
+            check_arguments(task, settings.kwargs, TASKS.values())
+            known = ("horizon_steps", CONTROL_MODE, IMAGE_SIZE, *defaults)
+            check_names("argument", settings.kwargs, known, where=task.id)
         arguments = {**defaults, **task.kwargs, **settings.kwargs}
-        for name, value in settings.kwargs.items():
-            check_argument(_argument_type(name), value, name=name, task=task.id)
+        for name in PHASES:
+            check_argument(int, arguments.get(name, 0), name=name, task=task.id)
         self._n_items = task.n_candidates(settings.kwargs)
-        _check_ranges(arguments, n_items=self._n_items, where=task.id)
         self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)
         self._in_order = task.memory == "sequential"
         self._touch_reach_m = MUG_REACH_M if task.id.startswith("ShellGame") else REACH_M
@@ -313,33 +317,7 @@ class FakeEnv:
         )
 
 
-def _argument_type(name: str) -> Any:  # Any: a type annotation
-    if name == "velocity_range_m_s":
-        return tuple[float, ...]
-    if name == CONTROL_MODE:
-        return str
-    return bool if isinstance(SEVERAL_DEFAULTS.get(name), bool) else int
-
-
 def _defaults(task: TaskSpec) -> Mapping[str, Any]:  # Any: numbers and pairs of them
     if not task.has_candidates:
         return BALL_DEFAULTS
     return {**(SEVERAL_DEFAULTS if task.several_right else CHOICE_DEFAULTS), **task.candidate_counts}
-
-
-def _check_ranges(arguments: Mapping[str, Any], *, n_items: int, where: str) -> None:  # Any: as above
-    n_items, n_shown = n_items or 1, arguments.get("n_shown", 1)
-    if not 1 <= n_shown <= n_items:
-        raise TaskArgumentError(f"{where}: n_shown={n_shown}: expected 1 to {n_items}, one per item.")
-    several = n_shown > 1 or "swap_order" in arguments
-    most = {
-        "swap_cue": 1 if n_items == 1 else n_items - n_shown if several else n_items - 1,
-        "swap_order": n_shown - 1,
-        "distract_steps": arguments.get("delay_steps", 0),
-    }
-    for name, largest in most.items():
-        if not 0 <= arguments.get(name, 0) <= largest:
-            raise TaskArgumentError(f"{where}: {name}={arguments[name]}: expected 0 to {largest}.")
-    speeds_m_s = arguments.get("velocity_range_m_s", (0.0, 0.0))
-    if len(speeds_m_s) != 2 or not 0 <= speeds_m_s[0] <= speeds_m_s[1]:
-        raise TaskArgumentError(f"{where}: velocity_range_m_s={speeds_m_s}: expected (least, most), ≥ 0.")

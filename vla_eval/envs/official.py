@@ -19,7 +19,7 @@ import torch
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.envs.official_mug import provide_mug
-from vla_eval.envs.official_settings import check_official
+from vla_eval.envs.official_settings import MUG, check_official
 from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates, to_vector
 from vla_eval.envs.scenes import build, describe, take_human_image, take_images
 from vla_eval.envs.true_states import with_true_states
@@ -52,7 +52,7 @@ class OfficialEnv:
         self._row, self._settings = row, settings
         self.device: dict[str, str] = {}
         if "/ShellGame" in row.id:
-            self.device["mug"] = provide_mug(settings.kwargs.get("mug", "ycb"), task=row.id)
+            self.device[MUG] = provide_mug(settings.kwargs.get(MUG, "ycb"), task=row.id)
         self._envs = [_build(cls, settings) for _ in range(settings.n_slots)]
         self._episodes: dict[int, OfficialEpisode] = {}
         self.device |= describe(self._envs[0], settings)

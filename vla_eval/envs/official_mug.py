@@ -18,7 +18,8 @@ import trimesh as trimesh_library
 from mani_skill import ASSET_DIR
 from mani_skill.utils.building.actors import ycb
 
-from vla_eval.errors import MissingDependencyError, TaskArgumentError
+from vla_eval.envs.official_settings import Mug
+from vla_eval.errors import MissingDependencyError
 from vla_eval.storage.cache import cached
 from vla_eval.tasks.objects.mug import (
     BOTTOM_POSE,
@@ -34,15 +35,12 @@ from vla_eval.tasks.objects.mug import (
 trimesh: Any = trimesh_library  # half of its functions have no types
 ASSET = "025_mug"
 FOLDER = "assets/mani_skill2_ycb"
-YCB, STAND_IN = "ycb", "stand_in"
 READERS = "mikasa_robo_suite."
 
 
-def provide_mug(mug: object, *, task: str) -> str:
+def provide_mug(mug: Mug, *, task: str) -> str:
     """Make the files of a mug, `ycb` or `stand_in`, findable; return what it is, for the run."""
-    if mug not in (YCB, STAND_IN):
-        raise TaskArgumentError(f"{task}: mug={mug!r}: expected '{YCB}' or '{STAND_IN}'.")
-    if mug == STAND_IN:
+    if mug == "stand_in":
         _read_from(_stand_in())
         return "stand-in of this package, not the YCB object"
     _read_from(ASSET_DIR)
@@ -50,7 +48,7 @@ def provide_mug(mug: object, *, task: str) -> str:
         raise MissingDependencyError(
             f"{task} needs the YCB asset '{ASSET}', expected in {ASSET_DIR / FOLDER}. Install it with "
             "`python -m mani_skill.utils.download_asset ycb`, or use a mug of the same size made by this "
-            f"package: --set env.mug={STAND_IN}."
+            "package: --set env.mug=stand_in."
         )
     return f"YCB {ASSET}"
 

@@ -1,16 +1,22 @@
 """What can be asked of the official package's environments; known without the package and a simulator."""
 
+from typing import Literal
+
 from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.environment import EnvSettings
 from vla_eval.errors import TaskArgumentError, check_names
+from vla_eval.tasks.arguments import HORIZON, check_argument
+from vla_eval.tasks.objects.limits import SomeSteps
 from vla_eval.tasks.spec import TaskSpec
 
-ARGUMENTS = ("horizon_steps", "mug")
+MUG = "mug"
+"""Name of the argument of the shell games: whose mug. Other tasks take it, too, for one run of all."""
+Mug = Literal["ycb", "stand_in"]
 
 
 def check_official(settings: EnvSettings, row: TaskSpec) -> None:
     """Refuse settings that the official environments do not have."""
-    check_names("argument", settings.kwargs, ARGUMENTS, where=row.id)
+    check_names("argument", settings.kwargs, (HORIZON, MUG), where=row.id)
     asked = {
         "sim_backend=gpu": settings.sim_backend == "gpu",
         "appearance": settings.appearance != AS_DESIGNED,
@@ -22,6 +28,7 @@ def check_official(settings: EnvSettings, row: TaskSpec) -> None:
                 f"{row.id}: {what}: the official environments run on the CPU simulator and look as they are. "
                 "Leave this setting out for them."
             )
-    horizon_steps = settings.kwargs.get("horizon_steps", row.horizon_steps)
-    if not isinstance(horizon_steps, int) or isinstance(horizon_steps, bool) or horizon_steps < 1:
-        raise TaskArgumentError(f"{row.id}: horizon_steps={horizon_steps!r}: expected a number ≥ 1.")
+    if HORIZON in settings.kwargs:
+        check_argument(SomeSteps, settings.kwargs[HORIZON], name=HORIZON, task=row.id)
+    if MUG in settings.kwargs:
+        check_argument(Mug, settings.kwargs[MUG], name=MUG, task=row.id)

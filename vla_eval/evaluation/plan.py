@@ -18,19 +18,21 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
-from vla_eval.cue_view import CueViewSettings
+from vla_eval.cue_view import CueViewSettings, no_cue_locator
 from vla_eval.envs.factory import describe_env
-from vla_eval.errors import RecipeError, some_of
+from vla_eval.errors import RecipeError, TaskArgumentError, some_of
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.resolve import ResolvedEvaluation, has_weights
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
 from vla_eval.seeding import SeedRange
+from vla_eval.specs import EnvSpec
 from vla_eval.storage.planned import part_of
 from vla_eval.storage.shard import Shard
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.strict.bounds import MAX_EPISODES
+from vla_eval.tasks.arguments import longest_wait_steps
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 from vla_eval.wire.metadata import ServerMetadata
@@ -154,7 +156,7 @@ def _groups_of_all(
     groups: list[EpisodeGroup] = []
     left_out: list[str] = []
     for task in tasks:
-        describe_env(_env_settings(config, task))
+        _check_changes(config, task, describe_env(_env_settings(config, task)))
         instruction = sentences_of(prompts, task)[0]
         for policy in (policy for policy in policies if policy.task in (None, task.id)):
             check_adapter(policy.value.adapter)
@@ -237,6 +239,25 @@ def _check_tasks(tasks: Sequence[TaskSpec], policies: Sequence[PolicyEntry]) -> 
                 f"policies: '{policy.name}' is named twice, once for all tasks and once for "
                 f"{some_of(filter(None, own))}. Give the two different names."
             )
+
+
+def _check_changes(config: EvalConfig, task: TaskSpec, env: EnvSpec) -> None:
+    """Refuse changes of what a policy sees or remembers that cannot be made in this task."""
+    view, reset_step = config.cue_view, config.reset_policy_at_step
+    has_phases = task.is_official or longest_wait_steps(task, config.env) > 0
+    if view != "as_shown" and not has_phases:
+        raise TaskArgumentError(
+            f"cue_view={view}: {task.id}: this task has no cue phase in which something could be hidden or "
+            "kept. Leave cue_view out for it."
+        )
+    if CueViewSettings(kind=view).hides and task.is_official:
+        raise no_cue_locator(view, task.id)
+    if reset_step is not None and reset_step >= env.horizon_steps:
+        raise TaskArgumentError(
+            f"reset_policy_at_step={reset_step}: {task.id}: the episode ends after "
+            f"{env.horizon_steps} steps: nothing would be reset. Use a smaller number, or increase "
+            "env.horizon_steps."
+        )
 
 
 def _check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:

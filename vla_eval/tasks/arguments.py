@@ -5,6 +5,7 @@ No simulator is started: the task's row and the source of its class say it all.
 
 import ast
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from vla_eval.config.environment import WristMesh
@@ -12,7 +13,6 @@ from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
 from vla_eval.errors import RecipeError, TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
-from vla_eval.strict.bounds import MAX_STEPS
 from vla_eval.strict.decoding import check_value
 from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS
 from vla_eval.tasks.interface import (
@@ -25,12 +25,14 @@ from vla_eval.tasks.interface import (
     step_range,
 )
 from vla_eval.tasks.objects import limits
-from vla_eval.tasks.objects.limits import LIMITED
+from vla_eval.tasks.objects.limits import LIMITED, check_together, n_swaps
 from vla_eval.tasks.source import class_constant, task_arguments
 from vla_eval.tasks.spec import TaskSpec, total_cue_steps
 
 HORIZON = "horizon_steps"
 ROBOT = "robot_uids"
+OWN = "vla_eval.tasks."
+"""Classes of other packages may count otherwise which other cues there are."""
 CHOICE_ARGUMENTS = ("strict_choice", "show_cue", "cue_after_steps")
 """Arguments that only tasks with candidates have."""
 ANNOTATIONS: Mapping[str, Any] = {  # Any: type annotations
@@ -44,7 +46,7 @@ ANNOTATIONS: Mapping[str, Any] = {  # Any: type annotations
 
 
 def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
-    """Check what can be wrong with a task's arguments, apart from limits that only its class knows.
+    """Check all that can be wrong with a task's arguments; a class of another package may refuse more.
 
     Args:
         spec: a row of the catalogue, or a family.
@@ -67,14 +69,15 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[
     action_spec(control_mode_of(given))
     if IMAGE_SIZE in given:
         checked_image_size(given[IMAGE_SIZE], task=spec.id)
-    for name, value in given.items():
-        if name.endswith("_steps"):
-            _check_steps(name, value, task=spec.id)
     if spec.is_official:
         return
     _check_names_and_types(spec, given)
     spec.n_candidates(given)
     _check_robot(spec, given)
+    try:
+        check_together(**_with_usual(spec, given))
+    except TaskArgumentError as exc:
+        raise TaskArgumentError(f"{spec.id}: {exc}") from exc
     horizon_steps(spec, longest_wait_steps(spec, given), given.get(HORIZON))
 
 
@@ -97,13 +100,29 @@ def _check_names_and_types(spec: TaskSpec, given: Mapping[str, object]) -> None:
         return
     check_names("argument", given, (HORIZON, *arguments), where=f"env of {spec.id}")
     for name, value in given.items():
-        check_argument(_type_of(arguments.get(name, "int")), value, name=name, task=spec.id)
+        check_argument(_type_of(arguments.get(name, "SomeSteps")), value, name=name, task=spec.id)
 
 
 def _type_of(annotation: str) -> Any:  # Any: a type annotation
     if annotation.startswith("Literal["):
         return Literal[ast.literal_eval(annotation.removeprefix("Literal[").removesuffix("]"))]
     return ANNOTATIONS.get(annotation, Any)
+
+
+def _with_usual(spec: TaskSpec, given: Mapping[str, object]) -> dict[str, Any]:  # Any: plain data
+    """Return all arguments of a task that are plain data, and what follows from them."""
+    found: dict[str, Any] = {}
+    for argument in task_arguments(spec.entry_point):
+        with suppress(ValueError):  # a calculation: the class alone knows what it gives
+            found[argument.name] = ast.literal_eval(argument.default)
+    found |= {**spec.kwargs, **given, CONTROL_MODE: control_mode_of(given)}
+    if spec.has_candidates:
+        found["n_items"] = spec.n_candidates(given)
+    if spec.entry_point.startswith(OWN):
+        found["n_swaps"] = n_swaps(**found)
+    if "delay_steps" in found:
+        found["least_delay"], _ = step_range("delay_steps", found["delay_steps"])
+    return {**found, "one_by_one": spec.shows_one_by_one}
 
 
 def _check_robot(spec: TaskSpec, given: Mapping[str, object]) -> None:
@@ -141,13 +160,10 @@ def longest_wait_steps(spec: TaskSpec, given: Mapping[str, object]) -> int:
     Raises:
         TaskArgumentError: one of them is not a number of steps, nor a pair of them.
     """
-    usual = {argument.name: argument.default for argument in task_arguments(spec.entry_point)}
+    arguments = _with_usual(spec, given)
 
     def most(name: str, *, otherwise: int = 0) -> int:
-        value = given.get(name, spec.kwargs.get(name))
-        if value is None and name in usual:
-            value = ast.literal_eval(usual[name])
-        return step_range(name, otherwise if value is None else value)[1]
+        return step_range(name, arguments.get(name, otherwise))[1]
 
     n_in_turn = most("n_shown", otherwise=1) if spec.shows_one_by_one else 1
     cue_steps = total_cue_steps(most("cue_steps"), n_in_turn, most("gap_steps"))
@@ -193,6 +209,9 @@ def offered_by(spec: TaskSpec, given: Mapping[str, object]) -> EnvSpec:
 def check_argument(hint: Any, value: object, *, name: str, task: str) -> None:  # Any: a type annotation
     """Raise `TaskArgumentError` unless an argument is of the type that the task declares for it."""
     try:
+        if hint is StepRange:
+            step_range(name, value)
+            return
         limited = next((kind for kind in (hint, *get_args(hint)) if get_origin(kind) is Annotated), None)
         is_given = value is not None or hint is limited
         check_value(get_args(limited)[0] if limited and is_given else hint, value, path=name)
@@ -200,14 +219,3 @@ def check_argument(hint: Any, value: object, *, name: str, task: str) -> None:  
             limits.check(limited, **{name: value})
     except (RecipeError, TaskArgumentError) as exc:
         raise TaskArgumentError(f"{task}: {exc}") from exc
-
-
-def _check_steps(name: str, value: object, *, task: str) -> None:
-    """Raise unless this is a number of control steps, or a pair of them."""
-    least = 1 if name == HORIZON else 0
-    for steps in value if isinstance(value, list | tuple) else (value,):
-        if not isinstance(steps, int) or isinstance(steps, bool) or not least <= steps <= MAX_STEPS:
-            raise TaskArgumentError(
-                f"{task}: {name}={value!r:.80}: expected a whole number of control steps, {least} to "
-                f"{MAX_STEPS}, or, where a duration may be drawn, a pair of them."
-            )

@@ -9,12 +9,11 @@ import torch
 from mani_skill.utils.building import actors
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.memory_env import poses
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Body, Flags, moving_body, position_of, velocity_of
-from vla_eval.tasks.objects.limits import Positive
+from vla_eval.tasks.objects.limits import BodySize
 from vla_eval.tasks.without_cue import WithoutCueEnv
 
 SPAWN_X_M = (-0.35, -0.05)
@@ -38,16 +37,13 @@ class RollingBallEnv(WithoutCueEnv):
         self,
         *args: Any,
         velocity_range_m_s: Sequence[float] = (0.5, 0.75),
-        ball_radius_m: Positive = 0.02,
+        ball_radius_m: BodySize = 0.02,
         **kwargs: Any,
     ) -> None:
-        pair = tuple(float(v) for v in velocity_range_m_s)
-        if len(pair) != 2 or not 0 < pair[0] <= pair[1]:
-            raise TaskArgumentError(
-                f"velocity_range_m_s={velocity_range_m_s!r}: expected (least, most) with 0 < least ≤ most."
-            )
-        limits.check(Positive, ball_radius_m=ball_radius_m)
-        self.velocity_range_m_s = pair
+        limits.check_together(velocity_range_m_s=velocity_range_m_s)
+        limits.check(BodySize, ball_radius_m=ball_radius_m)
+        least, most = velocity_range_m_s
+        self.velocity_range_m_s = (float(least), float(most))
         self.ball_radius_m = ball_radius_m
         super().__init__(*args, **kwargs)
 
@@ -77,8 +73,7 @@ class RollingBallEnv(WithoutCueEnv):
 
     def n_swaps(self) -> int:
         """Return 1: a speed half of the range away; 0 if there is only one speed."""
-        least, most = self.velocity_range_m_s
-        return int(most > least)
+        return limits.n_swaps(velocity_range_m_s=self.velocity_range_m_s)
 
     def _swapped_m_s(self, drawn_m_s: float) -> float:
         """Return the drawn speed, or with `swap_cue` the one that is half of the range away."""

@@ -17,7 +17,7 @@ from vla_eval.tasks.memory_env import MemoryTableEnv, Wxyz, nearness, poses
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere, length, positions_of
 from vla_eval.tasks.objects.layout import places_from_right
-from vla_eval.tasks.objects.limits import Positive
+from vla_eval.tasks.objects.limits import Positive, StepCount
 from vla_eval.tasks.tensors_out import Info
 
 NO_CHOICE = -1
@@ -48,10 +48,11 @@ class ChoiceEnv(MemoryTableEnv):
         goal_threshold_m: Positive,
         strict_choice: bool = False,
         show_cue: bool = True,
-        cue_after_steps: int = 0,
+        cue_after_steps: StepCount = 0,
         **kwargs: Any,
     ) -> None:
         limits.check(Positive, goal_threshold_m=goal_threshold_m)
+        limits.check(StepCount, cue_after_steps=cue_after_steps)
         self.goal_threshold_m = goal_threshold_m
         self.strict_choice = strict_choice
         self.show_cue = show_cue

@@ -11,7 +11,7 @@ from vla_eval.control_modes import EE_DELTA_POSE, action_spec
 from vla_eval.errors import TaskArgumentError
 from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES, POSE_NAMES
 from vla_eval.specs import CameraSpec, EnvSpec, StateSpec
-from vla_eval.strict.bounds import MAX_IMAGE_SIZE_PX, MIN_IMAGE_SIZE_PX
+from vla_eval.strict.bounds import MAX_IMAGE_SIZE_PX, MAX_STEPS, MIN_IMAGE_SIZE_PX
 
 IMAGE_SIZE = "image_size"
 """Name of the argument in `env`: height and width of the images of both cameras, in pixels."""
@@ -45,12 +45,14 @@ def step_range(name: str, value: object) -> tuple[int, int]:
     """Return (least, most) of a duration in control steps given as a number or as a pair.
 
     Raises:
-        TaskArgumentError: not a whole number ≥ 0, nor a pair of such numbers in order.
+        TaskArgumentError: not a whole number from 0 on, nor a pair of such numbers in order.
     """
     pair = tuple(value) if isinstance(value, list | tuple) else (value, value)
-    if len(pair) != 2 or not all(isinstance(v, int) and v >= 0 for v in pair) or pair[0] > pair[1]:
+    are_steps = all(type(steps) is int and 0 <= steps <= MAX_STEPS for steps in pair)
+    if len(pair) != 2 or not are_steps or pair[0] > pair[1]:
         raise TaskArgumentError(
-            f"{name}={value!r}: expected a number of control steps ≥ 0, or a pair (least, most) of them."
+            f"{name}={value!r:.80}: expected a whole number of control steps, 0 to {MAX_STEPS}, or a pair "
+            "(least, most) of them."
         )
     return int(pair[0]), int(pair[1])
 

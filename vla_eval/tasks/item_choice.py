@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import sapien
 
-from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv
 from vla_eval.tasks.memory_env import CueSize, Place
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
 from vla_eval.tasks.objects.items import Item, build_decoy, build_item
 from vla_eval.tasks.objects.layout import Plane, jittered, slot_centres_m
+from vla_eval.tasks.objects.limits import StepCount
 
 WIDEST_HALF_M = 0.03
 UPRIGHT_WXYZ = (1.0, 0.0, 0.0, 0.0)
@@ -36,7 +37,10 @@ class ItemChoiceEnv(ChoiceEnv):
             single items are shown; it is drawn per episode, and it is neither right nor was it shown.
     """
 
-    def __init__(self, *args: Any, items: tuple[Item, ...], distract_steps: int = 0, **kwargs: Any) -> None:
+    def __init__(
+        self, *args: Any, items: tuple[Item, ...], distract_steps: StepCount = 0, **kwargs: Any
+    ) -> None:
+        limits.check(StepCount, distract_steps=distract_steps)
         self.items = items
         self.distract_steps = distract_steps
         super().__init__(*args, **kwargs)
@@ -54,7 +58,6 @@ class ItemChoiceEnv(ChoiceEnv):
         self.candidates = [
             build_item(self.scene, item, initial_pose=self._parking_pose(item)) for item in self.items
         ]
-        self._check_distractor()
         self._hides_items = self.is_swapped() and not self.gpu_sim_enabled
         uses_decoys = self._hides_items or self.distract_steps > 0
         self.decoys = [
@@ -62,17 +65,6 @@ class ItemChoiceEnv(ChoiceEnv):
             for item in (self.items if uses_decoys else ())
         ]
         self._distractor: Indices = np.zeros(self.num_envs, dtype=np.int64)
-
-    def _check_distractor(self) -> None:
-        least_delay = self.delay_steps_range[0]
-        if not 0 <= self.distract_steps <= least_delay:
-            raise TaskArgumentError(
-                f"distract_steps={self.distract_steps}: expected 0 to {least_delay}, the steps of the delay."
-            )
-        if self.distract_steps and self.n_swaps() <= int(self.swap_cue > 0):
-            raise TaskArgumentError(
-                f"distract_steps={self.distract_steps}: every item is right or shown, so none is left for it."
-            )
 
     def is_swapped(self) -> bool:
         """Return whether another cue than the drawn one is shown."""

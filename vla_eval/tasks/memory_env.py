@@ -26,7 +26,7 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import TaskArgumentError, unknown_name
+from vla_eval.errors import unknown_name
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
@@ -93,6 +93,8 @@ class MemoryTableEnv(TensorsOut):
     MAX_REWARD: float
     FAMILY: int
     """Number of the task family in random streams. Part of every result: never renumber, only add."""
+    distract_steps = 0
+    """In so many steps of the delay something else is shown, in tasks that take this as an argument."""
     PROMPT_DIMS: tuple[str, ...] = ()
     """Names of the numbers that specify the goal, if a sentence cannot; rad."""
     HUMAN_CAMERA_EYE: tuple[float, float, float] = (0.5, 1.0, 1.0)
@@ -118,7 +120,14 @@ class MemoryTableEnv(TensorsOut):
         """Check the arguments and build the scene."""
         self.cue_steps_range = step_range("cue_steps", cue_steps)
         self.delay_steps_range = step_range("delay_steps", delay_steps)
-        self.swap_cue = self._checked_swap("swap_cue", swap_cue, most=self.n_swaps())
+        limits.check(NotNegative, swap_cue=swap_cue)
+        limits.check_together(
+            swap_cue=swap_cue,
+            n_swaps=self.n_swaps(),
+            distract_steps=self.distract_steps,
+            least_delay=self.delay_steps_range[0],
+        )
+        self.swap_cue = swap_cue
         self.freeze_until_choice = freeze_until_choice
         self.move_in_delay = move_in_delay
         self.phase_gate_success = phase_gate_success
@@ -144,17 +153,11 @@ class MemoryTableEnv(TensorsOut):
             reconfiguration_freq=reconfiguration_freq,
             **kwargs,
         )
-        self.check_motion()
+        limits.check_together(move_in_delay=move_in_delay, control_mode=self.control_mode)
 
     def n_swaps(self) -> int:
         """Return how many other cues the same scene could have; `swap_cue` selects one of them."""
         raise NotImplementedError
-
-    def _checked_swap(self, name: str, swap: int, *, most: int) -> int:
-        if isinstance(swap, bool) or not isinstance(swap, int) or not 0 <= swap <= most:
-            other = "as the cue has no other value with these arguments" if most == 0 else "0 for no swap"
-            raise TaskArgumentError(f"{name}={swap!r}: expected 0 to {most}, {other}.")
-        return swap
 
     # ---------------------------------------------------------------- scene
 
@@ -330,12 +333,8 @@ class MemoryTableEnv(TensorsOut):
         return {}
 
     def cue_places_m(self, env: int) -> list[Place]:
-        """Return where objects are shown as the cue of one environment's episode, each on the table.
-
-        Raises:
-            TaskArgumentError: the task has no cue phase.
-        """
-        raise TaskArgumentError("cue_view: this task has no cue phase in which something could be hidden.")
+        """Return where objects are shown as the cue of one environment's episode, each on the table."""
+        raise NotImplementedError
 
     def cue_size_m(self) -> CueSize:
         """Return a size that no object that is shown exceeds."""

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.item_choice import ItemChoiceEnv
@@ -70,7 +69,7 @@ class RememberEnv(ItemChoiceEnv):
 
     def n_swaps(self) -> int:
         """Return how many other items could be shown."""
-        return self.n_items - 1
+        return limits.n_swaps(n_items=self.n_items)
 
     def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         cue_begins = mask & (step == self.cue_after_steps) & (self._cue_end_step > step) & self.show_cue
@@ -151,13 +150,8 @@ class RememberShapeAndColorEnv(RememberEnv):
     ) -> None:
         limits.check(MixedShapeCount, n_shapes=n_shapes)
         limits.check(MixedColorCount, n_colors=n_colors)
-        if n_shapes * n_colors < 2:
-            raise TaskArgumentError("n_shapes × n_colors is 1: expected at least two items to choose among.")
+        limits.check_together(n_shapes=n_shapes, n_colors=n_colors, official_3x2=official_3x2)
         if official_3x2:
-            if (n_shapes, n_colors) != (3, 2):
-                raise TaskArgumentError(
-                    f"official_3x2 with n_shapes={n_shapes}, n_colors={n_colors}: it swaps 3 and 2 only."
-                )
             n_shapes, n_colors = 2, 3
         self.n_shapes, self.n_colors = n_shapes, n_colors
         items = [

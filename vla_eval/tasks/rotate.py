@@ -10,7 +10,6 @@ import sapien
 import torch
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.task_state import TaskStatus
 from vla_eval.tasks.memory_env import poses
@@ -27,7 +26,7 @@ from vla_eval.tasks.objects.bodies import (
     wrapped_rad,
     yaw_rad,
 )
-from vla_eval.tasks.objects.limits import Positive
+from vla_eval.tasks.objects.limits import BodySize, Positive
 from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import WithoutCueEnv
 
@@ -80,27 +79,22 @@ class RotateEnv(WithoutCueEnv):
         angle_threshold_rad: Positive = 0.1,
         position_threshold_m: Positive | None = None,
         tilt_threshold_rad: Positive | None = None,
-        peg_half_length_m: Positive = 0.12,
-        peg_half_width_m: Positive = 0.025,
+        peg_half_length_m: BodySize = 0.12,
+        peg_half_width_m: BodySize = 0.025,
         **kwargs: Any,
     ) -> None:
-        limits.check(
-            Positive,
+        limits.check(Positive, angle_threshold_rad=angle_threshold_rad)
+        limits.check(BodySize, peg_half_length_m=peg_half_length_m, peg_half_width_m=peg_half_width_m)
+        optional = {"position_threshold_m": position_threshold_m, "tilt_threshold_rad": tilt_threshold_rad}
+        limits.check(Positive, **{name: limit for name, limit in optional.items() if limit is not None})
+        limits.check_together(
+            angle_range_rad=angle_range_rad,
             angle_threshold_rad=angle_threshold_rad,
-            peg_half_length_m=peg_half_length_m,
-            peg_half_width_m=peg_half_width_m,
+            signed=signed,
+            official_signs=official_signs,
         )
-        for name, limit in (
-            ("position_threshold_m", position_threshold_m),
-            ("tilt_threshold_rad", tilt_threshold_rad),
-        ):
-            if limit is not None:
-                limits.check(Positive, **{name: limit})
-        self.angle_range_rad = _in_order(angle_range_rad, least_rad=angle_threshold_rad)
-        if self.angle_range_rad[1] > math.pi:
-            raise TaskArgumentError(f"angle_range_rad={angle_range_rad!r}: expected at most π.")
-        if official_signs and not signed:
-            raise TaskArgumentError("official_signs without signed: all angles are positive then.")
+        least, most = angle_range_rad
+        self.angle_range_rad = (float(least), float(most))
         self.signed, self.official_signs = signed, official_signs
         self.angle_threshold_rad = angle_threshold_rad
         self.position_threshold_m = position_threshold_m
@@ -148,14 +142,12 @@ class RotateEnv(WithoutCueEnv):
         return angle if positive else -angle
 
     def n_swaps(self) -> int:
-        """Return 1: the angle could be half of the range away, or have the other sign.
-
-        0 if an angle could then be right for both: the tolerances of the two must not overlap.
-        """
-        least, most = self.angle_range_rad
-        if self.signed:
-            return int(most <= math.pi - self.angle_threshold_rad)
-        return int((most - least) / 2 >= 2 * self.angle_threshold_rad)
+        """Return 1: the angle could be half of the range away, or have the other sign; 0 if it cannot."""
+        return limits.n_swaps(
+            angle_range_rad=self.angle_range_rad,
+            angle_threshold_rad=self.angle_threshold_rad,
+            signed=self.signed,
+        )
 
     def _on_episode_start(self, mask: Flags) -> None:
         half = torch.from_numpy(self._first_yaw / 2)  # torch's cosine: numpy's differs in the last bit
@@ -246,16 +238,3 @@ class RotateEnv(WithoutCueEnv):
 
     def _privileged_extra(self) -> Info:
         return {"oracle_info": self.oracle_info(), "peg_pose": pose_of(self.peg)}
-
-
-def _in_order(value: Any, *, least_rad: float) -> tuple[float, float]:
-    """Return (least, most), or raise `TaskArgumentError`."""
-    try:
-        low, high = (float(number) for number in value)
-    except (TypeError, ValueError):
-        low, high = 1.0, 0.0
-    if not least_rad <= low <= high:
-        raise TaskArgumentError(
-            f"angle_range_rad={value!r}: expected (least, most) in rad with {least_rad:g} ≤ least ≤ most."
-        )
-    return low, high

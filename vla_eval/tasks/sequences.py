@@ -11,7 +11,6 @@ import sapien
 from numpy.typing import NDArray
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.memory_env import Place, nearness
@@ -20,11 +19,12 @@ from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
 from vla_eval.tasks.objects.limits import (
     CubeHalfSize,
-    DwellSteps,
     ItemCount,
     NotNegative,
     Positive,
     ShownCount,
+    SomeSteps,
+    StepCount,
 )
 from vla_eval.tasks.spec import chance_of_several, total_cue_steps
 from vla_eval.tasks.tensors_out import Info
@@ -97,8 +97,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
         *args: Any,
         n_items: ItemCount = 9,
         n_shown: ShownCount = 3,
-        gap_steps: NotNegative = 0,
-        dwell_steps: DwellSteps = 1,
+        gap_steps: StepCount = 0,
+        dwell_steps: SomeSteps = 1,
         swap_order: NotNegative = 0,
         shuffle_cue: bool = False,
         goal_threshold_m: Positive = TOUCH_RADIUS_M,
@@ -108,23 +108,20 @@ class SeveralColorsEnv(ItemChoiceEnv):
     ) -> None:
         limits.check(ItemCount, n_items=n_items)
         limits.check(ShownCount, n_shown=n_shown)
-        if n_shown > n_items:
-            raise TaskArgumentError(f"n_shown={n_shown}: expected at most n_items={n_items}.")
-        limits.check(NotNegative, gap_steps=gap_steps)
-        limits.check(DwellSteps, dwell_steps=dwell_steps)
-        if gap_steps and not self.ONE_BY_ONE:
-            raise TaskArgumentError(f"gap_steps={gap_steps}: the cubes of this task are shown together.")
-        if not phase_gate_success:
-            raise TaskArgumentError(
-                "phase_gate_success=False: in these tasks touches count only in the response phase, as in "
-                "the official code. Remove this argument."
-            )
+        limits.check(StepCount, gap_steps=gap_steps)
+        limits.check(SomeSteps, dwell_steps=dwell_steps)
+        limits.check(NotNegative, swap_order=swap_order)
+        limits.check_together(
+            n_items=n_items,
+            n_shown=n_shown,
+            gap_steps=gap_steps,
+            swap_order=swap_order,
+            shuffle_cue=shuffle_cue,
+            phase_gate_success=phase_gate_success,
+            one_by_one=self.ONE_BY_ONE,
+        )
         self.n_shown, self.gap_steps, self.dwell_steps = n_shown, gap_steps, dwell_steps
-        most = n_shown - 1 if self.ONE_BY_ONE else 0
-        self.swap_order = self._checked_swap("swap_order", swap_order, most=most)
-        if shuffle_cue and most == 0:
-            raise TaskArgumentError("shuffle_cue: the cue of this task is not several cubes in turn.")
-        self.shuffle_cue = shuffle_cue
+        self.swap_order, self.shuffle_cue = swap_order, shuffle_cue
         self._touch_height_m = cube_half_size_m + TOUCH_ABOVE_TOP_M
         shape = cube(cube_half_size_m)
         items = tuple(Item(shape, color) for color in COLORS[:n_items])
@@ -184,7 +181,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     def n_swaps(self) -> int:
         """Return how many cubes that are not shown could be shown instead of the first one."""
-        return self.n_items - self.n_shown
+        return limits.n_swaps(n_items=self.n_items, n_shown=self.n_shown)
 
     def _on_episode_start(self, mask: Flags) -> None:
         super()._on_episode_start(mask)

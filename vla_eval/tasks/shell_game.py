@@ -16,8 +16,10 @@ from vla_eval.seeding import Stream
 from vla_eval.tasks.choice import ChoiceEnv
 from vla_eval.tasks.interface import StepRange
 from vla_eval.tasks.memory_env import CueSize, Place, Wxyz, poses
+from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects import mug as mugs
 from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere, pose_of
+from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
 
 N_MUGS = 3
@@ -105,7 +107,7 @@ class ShellGameEnv(ChoiceEnv):
 
     def n_swaps(self) -> int:
         """Return at how many other places the ball could lie."""
-        return N_MUGS - 1
+        return limits.n_swaps(n_items=N_MUGS)
 
     def _on_episode_start(self, mask: Flags) -> None:
         super()._on_episode_start(mask)
@@ -157,7 +159,7 @@ class ShellGameTouchEnv(ShellGameEnv):
     MAX_REWARD = 3.0
     REACH_SCALE_PER_M = 5.0
 
-    def __init__(self, *args: Any, goal_threshold_m: float = 0.08, **kwargs: Any) -> None:
+    def __init__(self, *args: Any, goal_threshold_m: Positive = 0.08, **kwargs: Any) -> None:
         """Give the threshold its default."""
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
 

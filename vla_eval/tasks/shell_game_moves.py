@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.memory_env import Wxyz, nearness
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import (
@@ -129,11 +128,7 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     ) -> None:
         """Refuse a goal that contains the mug's first position."""
         limits.check(Positive, push_distance_m=push_distance_m)
-        if not 0 < goal_threshold_m < push_distance_m:
-            raise TaskArgumentError(
-                f"goal_threshold_m={goal_threshold_m}: expected > 0 and less than push_distance_m="
-                f"{push_distance_m}, or the mug stands in the goal before anything is done."
-            )
+        limits.check_together(goal_threshold_m=goal_threshold_m, push_distance_m=push_distance_m)
         self.push_distance_m = push_distance_m
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
 
@@ -182,11 +177,7 @@ class ShellGamePickEnv(ShellGameMoveEnv):
     ) -> None:
         """Refuse a goal that contains the mug's first position, and one that the arm cannot reach."""
         limits.check(LiftHeight, lift_height_m=lift_height_m)
-        if goal_threshold_m is not None and not 0 < goal_threshold_m < lift_height_m:
-            raise TaskArgumentError(
-                f"goal_threshold_m={goal_threshold_m}: expected > 0 and less than lift_height_m="
-                f"{lift_height_m}, or the mug is at the goal before anything is done."
-            )
+        limits.check_together(goal_threshold_m=goal_threshold_m, lift_height_m=lift_height_m)
         self.lift_height_m = lift_height_m
         self.goal_is_a_point = goal_threshold_m is not None
         self.official_mug_yaws = official_mug_yaws

@@ -7,7 +7,6 @@ import sapien
 from mani_skill.utils.building import actors
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import TaskArgumentError
 from vla_eval.seeding import Stream
 from vla_eval.tasks.intercept import UPWARDS_WXYZ
 from vla_eval.tasks.memory_env import nearness, poses
@@ -24,15 +23,17 @@ from vla_eval.tasks.objects.bodies import (
     resting_body,
     velocity_of,
 )
-from vla_eval.tasks.objects.limits import Positive
+from vla_eval.tasks.objects.layout import (
+    GOAL_X_M,
+    GOAL_Y_M,
+    START_BAND_WIDTH_M,
+    START_BANDS_Y_M,
+    START_X_M,
+)
+from vla_eval.tasks.objects.limits import BodySize, GoalRadius, Positive
 from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import WithoutCueEnv
 
-START_X_M = (-0.05, 0.05)
-START_BANDS_Y_M = (-0.1, 0.0, 0.1)
-START_BAND_WIDTH_M = 0.05  # y is uniform from a band's number on, over this width
-GOAL_X_M = (0.2, 0.25)
-GOAL_Y_M = (-0.025, 0.025)
 DISC_Z_M = 0.001
 DISC_HALF_THICKNESS_M = 1e-5
 PUSH_BEHIND_M = 0.025  # distance of the reward's push point behind the cube, seen from the goal,
@@ -74,23 +75,15 @@ class TakeItBackEnv(WithoutCueEnv):
     def __init__(
         self,
         *args: Any,
-        goal_radius_m: Positive = 0.08,
+        goal_radius_m: GoalRadius = 0.08,
         return_radius_m: Positive = 0.08,
-        cube_half_size_m: Positive = 0.02,
+        cube_half_size_m: BodySize = 0.02,
         latch_goal_color: bool = True,
         **kwargs: Any,
     ) -> None:
-        limits.check(
-            Positive,
-            goal_radius_m=goal_radius_m,
-            return_radius_m=return_radius_m,
-            cube_half_size_m=cube_half_size_m,
-        )
-        if goal_radius_m >= GOAL_X_M[0] - START_X_M[1]:
-            raise TaskArgumentError(
-                f"goal_radius_m={goal_radius_m}: expected less than {GOAL_X_M[0] - START_X_M[1]:g}, or the "
-                "cube can lie in the goal region from the start."
-            )
+        limits.check(GoalRadius, goal_radius_m=goal_radius_m)
+        limits.check(Positive, return_radius_m=return_radius_m)
+        limits.check(BodySize, cube_half_size_m=cube_half_size_m)
         self.goal_radius_m = goal_radius_m
         self.return_radius_m = return_radius_m
         self.cube_half_size_m = cube_half_size_m
@@ -137,7 +130,7 @@ class TakeItBackEnv(WithoutCueEnv):
 
     def n_swaps(self) -> int:
         """Return in how many other bands the cube could lie."""
-        return len(START_BANDS_Y_M) - 1
+        return limits.n_swaps()
 
     def _on_episode_start(self, mask: Flags) -> None:
         self._goal_reached[mask] = False

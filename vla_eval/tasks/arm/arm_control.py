@@ -11,7 +11,7 @@ import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.geometry.rotation_conversions import matrix_to_euler_angles, quaternion_to_matrix
 
-from vla_eval.control_modes import ABSOLUTE_MODES, EE_DELTA_POS, EE_DELTA_POSE, EE_POSE, JOINT_POS
+from vla_eval.control_modes import ABSOLUTE_MODES, EE_POSE, JOINT_POS
 from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.arm.arms import Arm
@@ -108,14 +108,6 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
                 return np.zeros(1, dtype=np.bool_)
         grasped: Flags = self.agent.is_grasping(actor).cpu().numpy()
         return grasped
-
-    def check_motion(self) -> None:
-        """Raise `TaskArgumentError` if the scripted motion cannot be made in this control mode."""
-        if self.move_in_delay and self.control_mode not in (EE_DELTA_POSE, EE_DELTA_POS):
-            raise TaskArgumentError(
-                f"move_in_delay with control_mode={self.control_mode!r}: its motion is given in "
-                f"{EE_DELTA_POSE} and {EE_DELTA_POS} only. Use one of these modes, or leave it out."
-            )
 
     def hold_action(self) -> FloatArray:
         """Return the (B, A) action that moves neither arm nor fingers, with the present gripper width.

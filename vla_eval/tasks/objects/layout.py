@@ -17,6 +17,13 @@ SQUEEZE_M = {5: 0.025, 9: 0.025}
 
 ARC_CENTRE_X_M = -0.25  # the places of the official arc lie around (-0.25, 0)
 
+# TakeItBack: where the cube can lie at the start, and its goal.
+START_X_M = (-0.05, 0.05)
+START_BANDS_Y_M = (-0.1, 0.0, 0.1)
+START_BAND_WIDTH_M = 0.05  # y is uniform from a band's number on, over this width
+GOAL_X_M = (0.2, 0.25)
+GOAL_Y_M = (-0.025, 0.025)
+
 Plane = NDArray[np.float64]
 """Positions in the table's plane, (…, 2), m."""
 
