@@ -81,6 +81,36 @@ def test_only_what_takes_long_is_imported_before_the_fork() -> None:
     assert simulator_modules("maniskill") == ("vla_eval.envs.maniskill",)
 
 
+PREPARING = """
+import os, sys, time
+from multiprocessing import forkserver
+from vla_eval.workers.local import LOCAL
+LOCAL.prepare(("imported_for_workers",))
+print(os.getpid(), forkserver._forkserver._forkserver_pid, flush=True)
+time.sleep(float(sys.argv[1]))
+"""
+
+
+@pytest.mark.parametrize("kills", [False, True])
+def test_what_was_prepared_imports_before_there_is_a_worker_and_ends_with_the_command(
+    tmp_path: Path, kills: bool
+) -> None:
+    note = tmp_path / "imported"
+    module = tmp_path / "imported_for_workers.py"
+    module.write_text(f"import time, pathlib; pathlib.Path({str(note)!r}).touch(); time.sleep(600)")
+    command = [sys.executable, "-c", PREPARING, "600" if kills else "0"]
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)])}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=env) as parent:
+        assert parent.stdout is not None
+        command_pid, server = map(int, parent.stdout.readline().split())
+        assert parent.pid == command_pid
+        if kills:
+            wait_until(note.exists)
+            assert is_alive(server)
+            parent.send_signal(signal.SIGKILL)
+    wait_until(lambda: not is_alive(server))
+
+
 def test_a_worker_ends_with_a_command_that_is_killed() -> None:
     with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None

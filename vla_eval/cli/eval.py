@@ -22,7 +22,6 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.errors import RecipeError, unknown_name
-from vla_eval.evaluation.model_table import is_model_table
 from vla_eval.storage.shard import shard_folder
 from vla_eval.strict.decoding import set_field
 from vla_eval.workers.needed_files import Needed, shared_folder
@@ -136,10 +135,13 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.policies.entries import load_policy_entries, refuse_unfetched
     from vla_eval.storage.run_folder import read_run
 
-    if args.config is not None and is_model_table(args.config):
-        from vla_eval.cli.shared.model_table import evaluate_table
+    if args.config is not None:
+        from vla_eval.evaluation.model_table import is_model_table
 
-        return evaluate_table(args)
+        if is_model_table(args.config):
+            from vla_eval.cli.shared.model_table import evaluate_table
+
+            return evaluate_table(args)
     if args.tiny:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)

@@ -101,6 +101,8 @@ def evaluate(
             episodes in a row ended in an error; errors of the store. Records that are stored stay.
     """
     observer, path, plan = observer or EvaluationObserver(), resolved.out, make_plan(resolved)
+    if not path.exists():  # else nothing may be left to run
+        resolved.backend.prepare(_modules(resolved.config, plan))
     with RunFolder.open(
         path,
         describe(resolved, plan, command),

@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of
@@ -14,8 +15,9 @@ from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.records import EpisodeError
-from vla_eval.serving.host import HostOptions
-from vla_eval.serving.shared import KEY_VARIABLE, SharedServers
+
+if TYPE_CHECKING:
+    from vla_eval.serving.shared import SharedServers
 
 CONNECTION_ERRORS = frozenset(
     error.__name__ for error in (RemoteConnectionError, RemoteReplyError, RemoteTimeoutError)
@@ -46,7 +48,7 @@ class ReadyPhase:
     """A phase as workers get it, and the servers that its episodes need; None: it needs none."""
 
     jobs: Sequence[EpisodeJob]
-    servers: SharedServers | None
+    servers: "SharedServers | None"
 
     def lost_its_server(self, error: EpisodeError) -> bool:
         """Whether an episode's error comes of a server that is there no longer."""
@@ -66,6 +68,10 @@ def with_servers(
     if phase.policy is None:
         yield ReadyPhase(jobs=phase.jobs, servers=None)
         return
+    # Here and not above: most evaluations share no policy, and servers take long to import.
+    from vla_eval.serving.host import HostOptions
+    from vla_eval.serving.shared import SharedServers
+
     config = resolved.config
     options = HostOptions(policy=plan.shared[phase.policy], max_batch=config.inference_max_batch)
     adapters = [job.group.adapter for job in phase.jobs[:1]]
@@ -84,7 +90,7 @@ def with_servers(
         yield ReadyPhase(jobs=[_remote(job, servers, config) for job in phase.jobs], servers=servers)
 
 
-def _check_same(policy: str, plan: Plan, servers: SharedServers) -> None:
+def _check_same(policy: str, plan: Plan, servers: "SharedServers") -> None:
     planned, found = plan.recipe_hashes[f"policies/{policy}"], servers.metadata.recipe_sha256
     if planned != found:
         raise RunChangedError(
@@ -93,7 +99,9 @@ def _check_same(policy: str, plan: Plan, servers: SharedServers) -> None:
         )
 
 
-def _remote(job: EpisodeJob, servers: SharedServers, config: EvalConfig) -> EpisodeJob:
+def _remote(job: EpisodeJob, servers: "SharedServers", config: EvalConfig) -> EpisodeJob:
+    from vla_eval.serving.shared import KEY_VARIABLE
+
     n_rows = servers.metadata.batch_max or 1
     args = {
         "url": servers.urls,

@@ -89,6 +89,9 @@ class Backend(Protocol):
     def n_gpus(self) -> int:
         """How many GPUs there are."""
 
+    def prepare(self, preload: Sequence[str]) -> None:
+        """Begin the slow imports of workers to come, before their jobs are known; returns at once."""
+
     def pool[J: Job, A](self, spec: WorkerSpec, *, size: int, takes_gpu: bool = False) -> Pool[J, A]:
         """Return at most `size` workers; each takes a whole GPU, where there are some and it `takes_gpu`."""
 

@@ -78,6 +78,9 @@ class InProcessBackend:
         """How many GPUs this process may use."""
         return len(visible_gpus())
 
+    def prepare(self, preload: Sequence[str]) -> None:
+        """Do nothing: there is no other process."""
+
     def pool[J: Job, A](self, spec: WorkerSpec, *, size: int, takes_gpu: bool = False) -> InProcessPool[J, A]:
         """Return the one worker, whatever the size."""
         return InProcessPool(spec)

@@ -7,7 +7,7 @@ from pathlib import Path
 from vla_eval.workers.jobs import Job
 from vla_eval.workers.pool import WorkerPool
 from vla_eval.workers.process import WorkerMain, WorkerProcess, WorkerSpec
-from vla_eval.workers.start import available_cores, visible_gpus, worker_context
+from vla_eval.workers.start import available_cores, start_server, visible_gpus, worker_context
 
 LOOPBACK = "127.0.0.1"
 
@@ -36,6 +36,10 @@ class LocalBackend:
     def n_gpus(self) -> int:
         """How many GPUs this process may use."""
         return len(visible_gpus())
+
+    def prepare(self, preload: Sequence[str]) -> None:
+        """Start the process that workers are forked from."""
+        start_server(preload)
 
     def pool[J: Job, A](self, spec: WorkerSpec, *, size: int, takes_gpu: bool = False) -> WorkerPool[J, A]:
         """Return worker processes; those that take a GPU each share all of them, so there is one."""

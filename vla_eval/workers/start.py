@@ -71,6 +71,17 @@ def worker_context(*, preload: Sequence[str] = ()) -> ForkServerContext | SpawnC
     return context
 
 
+def start_server(preload: Sequence[str]) -> None:
+    """Begin the slow imports of workers to come; returns at once."""
+    if isinstance(worker_context(preload=preload), ForkServerContext):
+        start_by_lasting_thread(_start_server)
+
+
+def _start_server() -> None:
+    with worker_environment(), contextlib.suppress(OSError):  # which a worker's start will report
+        forkserver.ensure_running()
+
+
 def simulator_modules(simulator: Simulator) -> tuple[str, ...]:
     """Return what workers that run a simulator need and what takes long to import."""
     return ("vla_eval.envs.maniskill",) if simulator == "maniskill" else ()

@@ -156,6 +156,9 @@ def record(
         VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk.
     """
     plan = plan_recording(recipe)
+    preload = (WORKER_MODULE, *simulator_modules(recipe.simulator))
+    if not out.exists():
+        backend.prepare(preload)
     part = part and part.of_blocks(recipe.episodes_per_shard, recipe.episodes)
     versions = {one.task: one.task_version for one in plan.tasks}
     description = RunDescription(
@@ -176,7 +179,7 @@ def record(
             answers=(Attempt, ShardWritten, DatasetWritten),
             timeouts=recipe.timeouts,
             logs=folder.logs(),
-            preload=(WORKER_MODULE, *simulator_modules(recipe.simulator)),
+            preload=preload,
         )
         pool: RecordingPool = backend.pool(spec, size=n_workers)
         with pool as running:

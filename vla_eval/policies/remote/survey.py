@@ -9,7 +9,6 @@ from typing import Any, NamedTuple  # Any: what a recipe holds
 from vla_eval.config.files import Recipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.errors import RecipeError, RemoteChangedError
-from vla_eval.policies.remote.connecting import connect_all
 from vla_eval.policies.remote.settings import ADAPTER, RemoteSettings, remote_settings, settings_digest
 from vla_eval.wire.addresses import address_name, split_urls
 from vla_eval.wire.metadata import ServerMetadata
@@ -63,6 +62,9 @@ def moved(recipe: Recipe[PolicyRecipe], urls: str) -> PolicyRecipe:
 
 
 def _survey(settings: RemoteSettings) -> ServerMetadata:
+    # Here and not above: most evaluations have no server, and the client takes long to import.
+    from vla_eval.policies.remote.connecting import connect_all
+
     connected = connect_all(split_urls(settings.url), settings, connect_seconds=0.0)
     for one in connected:
         one.client.close()

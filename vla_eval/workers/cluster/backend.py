@@ -37,6 +37,9 @@ class ClusterBackend:
         """How many GPUs the cluster may use."""
         return sum(machine.n_gpus for machine in self.machines.usable)
 
+    def prepare(self, preload: Sequence[str]) -> None:
+        """Do nothing: each machine starts its workers by itself."""
+
     def pool[J: Job, A](self, spec: WorkerSpec, *, size: int, takes_gpu: bool = False) -> ClusterPool[J, A]:
         """Return workers, one core each, and one GPU each where they take one and there is one."""
         takes_gpu = takes_gpu and self.n_gpus > 0
