@@ -11,12 +11,13 @@ from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import TASK, Bench
 from tests.evaluation.resolved import default_run_folder, evaluate
 from vla_eval.cli.main import main
-from vla_eval.errors import RunChangedError
+from vla_eval.errors import RecipeError, RunChangedError
 from vla_eval.evaluation import evaluate as evaluate_module
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.report import build_table
 from vla_eval.storage.run_folder import read_run
 from vla_eval.workers.load import Load
+from vla_eval.workers.local import LocalBackend
 
 bench = evaluation_bench.bench
 
@@ -64,6 +65,25 @@ class TestSlots:
         bench.run("out")
         with pytest.raises(RunChangedError, match="slots_per_worker"):
             bench.run("out", slots_per_worker=2)
+
+
+# ------------------------------------------------------------------------------------------ start
+
+
+def test_only_a_new_run_that_can_be_run_prepares_workers(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    prepared: list[tuple[str, ...]] = []
+    monkeypatch.setattr(LocalBackend, "prepare", lambda _, preload: prepared.append(preload))
+    with pytest.raises(RecipeError, match="prompt_set"):
+        bench.run("refused", env={"instruction": "go"})
+    assert prepared == []
+
+    bench.run("out", policies=["random"])
+    assert prepared == [("vla_eval.evaluation.worker", "vla_eval.policies.controls.scripted")]
+
+    bench.run("out", policies=["random"])
+    assert len(prepared) == 1
 
 
 # ------------------------------------------------------------------------------------------ sameness
