@@ -11,6 +11,9 @@ import math
 from collections.abc import Mapping
 from typing import Any  # ManiSkill is untyped: its environments and infos are Any here
 
+import vla_eval.envs.lean_import  # noqa: F401  first: the others import ManiSkill
+
+# isort: split
 import numpy as np
 import torch
 

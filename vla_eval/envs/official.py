@@ -13,6 +13,9 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple  # ManiSkill and the package are untyped: environments, infos are Any here
 
+import vla_eval.envs.lean_import  # noqa: F401  first: the others import ManiSkill
+
+# isort: split
 import numpy as np
 import torch
 
