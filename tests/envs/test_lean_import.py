@@ -103,7 +103,7 @@ print(callable(leastsq), round(box.bounding_sphere.primitive.radius, 3), "PickCu
 """
 
 
-def test_an_episode_needs_none_of_them_and_whoever_does_gets_them() -> None:
+def test_an_episode_needs_none_of_them_and_other_code_gets_them() -> None:
     """If a version of ManiSkill uses one of them to run an episode, it costs time and changes nothing."""
     done = subprocess.run([sys.executable, "-c", EPISODE], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
