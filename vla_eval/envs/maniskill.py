@@ -83,14 +83,19 @@ class ManiSkillEnv:
 
     def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
         """Execute one control step in each of the given slots; see `SimEnv.step`."""
-        results: dict[int, StepResult] = {}
-        for index, slots in self._by_env(actions):
+        stepped = self._by_env(actions)
+        for index, _ in stepped:
             first = index * self._slots_per_env
             rows = [
                 actions[slot] if slot in actions else self.hold_action(slot)
                 for slot in range(first, first + self._slots_per_env)
             ]
-            self._envs[index].advance(np.stack(rows))
+            self._envs[index].drive(np.array(rows))
+        for index, _ in stepped:
+            self._envs[index].simulate()
+        results: dict[int, StepResult] = {}
+        for index, slots in stepped:
+            self._envs[index].finish()
             results |= self._results(index, slots, render)
         return results
 

@@ -278,7 +278,7 @@ class MemoryTableEnv(TensorsOut):
         if self.gpu_sim_enabled:
             self.scene._gpu_fetch_all()
         step = self.step_count() + 1  # ManiSkill counts only after this hook
-        moved = self._on_phase_edges(step, np.ones_like(step, dtype=np.bool_))
+        moved = self._on_phase_edges(step, step > 0)  # in all environments
         if moved and self.gpu_sim_enabled:
             self.scene._gpu_apply_all()
             self.scene._gpu_fetch_all()

@@ -44,9 +44,14 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     _response_step: Steps
 
     def step_count(self) -> Steps:
-        """Return (B,) the control steps since the reset."""
-        steps: Steps = self._elapsed_steps.cpu().numpy()
-        return steps
+        """Return (B,) the control steps since the reset; on the CPU simulator they go on counting."""
+        if self._counted is not self._elapsed_steps or self.gpu_sim_enabled:
+            self._counted = self._elapsed_steps
+            self._count = self._counted.cpu().numpy()
+        return self._count
+
+    _counted: Any = None  # the tensor of which `_count` is the memory, on the CPU simulator
+    _count: Steps
 
     def qpos(self) -> FloatArray:
         """Return the (B, J) joint positions, rad, and m for the fingers."""
@@ -140,19 +145,15 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         """Return the (B, J) joint positions, rad, at which the arm aims since the last action."""
         return to_array(self.agent.controller.controllers["arm"]._target_qpos)
 
-    def advance(self, actions: FloatArray) -> None:
-        """Execute one control step: `executed_action` says what was done. Reads nothing.
+    # ---------------------------------------------------------------- the three parts of a control step
+    # Environments that step together do each part in turn: what a part needs is then in the processor's caches.
 
-        Args:
-            actions: (B, A) float32.
+    def drive(self, actions: FloatArray) -> None:
+        """Give (B, A) float32 actions to the arm's controllers: `executed_action` says what will be done.
 
         Raises:
             ValueError: an action is not a number.
         """
-        self._execute(actions)
-        self._elapsed_steps += 1
-
-    def _execute(self, actions: FloatArray) -> None:
         if anywhere(np.isnan(actions)):
             raise ValueError(f"An action is not a number: {actions.tolist()}.")
         if self.freeze_until_choice or self.move_in_delay:
@@ -160,15 +161,27 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         space = self.single_action_space
         self.executed_action = np.minimum(np.maximum(actions, space.low), space.high)
         # ManiSkill clips only numbers that it scales.
-        driven = self.executed_action if self.control_mode in ABSOLUTE_MODES else actions
+        self._driven_action = self.executed_action if self.control_mode in ABSOLUTE_MODES else actions
+        if not self.gpu_sim_enabled:
+            for part, drive in self._drives():
+                drive(self._driven_action[0, part])
+
+    def simulate(self) -> None:
+        """Let the time of one control step pass."""
         if self.gpu_sim_enabled:
-            super()._step_action(torch.as_tensor(driven, device=self.device))
+            super()._step_action(torch.as_tensor(self._driven_action, device=self.device))
             return
-        for part, drive in self._drives():
-            drive(driven[0, part])
+        step = self.scene.px.step
         for _ in range(self._sim_steps_per_control):
-            self.scene.px.step()
+            step()
+
+    def finish(self) -> None:
+        """Hide and reveal objects, record what happened, and count the step."""
+        if self.gpu_sim_enabled:  # ManiSkill's own step has done the rest
+            self._elapsed_steps += 1
+            return
         self._after_control_step()
+        self.step_count()[:] += 1
 
     _driven: Any = None  # the controller that the drives are of; a new scene has another one
 
@@ -182,7 +195,10 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             self.executed_action = None
             return super()._step_action(action)
         given = to_array(action) if torch.is_tensor(action) else np.asarray(action, dtype=np.float32)
-        self._execute(given.reshape(self.num_envs, -1))
+        self.drive(given.reshape(self.num_envs, -1))
+        self.simulate()
+        if not self.gpu_sim_enabled:
+            self._after_control_step()
         return torch.as_tensor(given, device=self.device)
 
     def _replaced(self, actions: FloatArray) -> FloatArray:

@@ -31,6 +31,7 @@ Drive = Callable[[FloatArray], None]
 ZERO, ONE = np.float32(0), np.float32(1)
 LEAST = np.float32(0.1)  # of what quaternions are divided by
 MAX_ITERATIONS = 100  # of the inverse kinematics, as in ManiSkill
+SURELY_SHORT = 0.999  # a rotation's square sum up to which its norm rounds to 1 at most
 
 
 def drives_of(agent: Any) -> list[tuple[slice, Drive]]:
@@ -61,18 +62,21 @@ class _Joints:
     def __init__(self, controller: Any) -> None:
         self._controller = controller
         self._robot = controller.articulation._objs[0]
-        self._joints = [joint._objs[0] for joint in controller.joints]
+        self._set_targets = [joint._objs[0].set_drive_target for joint in controller.joints]
         self._indices = controller.active_joint_indices.numpy()
+        self._shared = torch.zeros((1, len(controller.joints)))  # one memory for a tensor and an array
+        self._targets: FloatArray = self._shared.numpy()
 
     def qpos(self) -> FloatArray:
         found: FloatArray = self._robot.qpos[self._indices]
         return found
 
     def drive_to(self, targets: FloatArray) -> None:
+        self._targets[0] = targets
         # ManiSkill's name for it: `joint_targets` reads it, and a controller's reset writes it.
-        self._controller._target_qpos = torch.from_numpy(targets)[None]
-        for joint, target in zip(self._joints, targets.tolist(), strict=True):
-            joint.set_drive_target(target)
+        self._controller._target_qpos = self._shared
+        for set_target, target in zip(self._set_targets, targets.tolist(), strict=True):
+            set_target(target)
 
 
 def _scaling(controller: Any, part: slice = slice(None)) -> Callable[[FloatArray], FloatArray]:
@@ -100,15 +104,12 @@ def _mimic_drive(controller: Any) -> Drive:
     joints, scaled = _Joints(controller), _scaling(controller)
     controls = controller.control_joint_indices.numpy()
     mimics, of = controller.mimic_joint_indices.numpy(), controller.mimic_control_joint_indices.numpy()
-    multiplier, offset = controller._multiplier.numpy(), controller._offset.numpy()
-
-    def drive(action: FloatArray) -> None:
-        targets = np.empty(len(controls) + len(mimics), dtype=np.float32)
-        targets[controls] = scaled(action)
-        targets[mimics] = targets[of] * multiplier + offset
-        joints.drive_to(targets)
-
-    return drive
+    n = len(controls) + len(mimics)
+    source, multiplier, offset = np.zeros(n, np.intp), np.ones(n, np.float32), np.zeros(n, np.float32)
+    source[controls] = np.arange(len(controls))
+    source[mimics] = source[of]
+    multiplier[mimics], offset[mimics] = controller._multiplier.numpy(), controller._offset.numpy()
+    return lambda action: joints.drive_to(scaled(action)[source] * multiplier + offset)
 
 
 def _pose_drive(controller: Any) -> Drive:
@@ -120,13 +121,14 @@ def _pose_drive(controller: Any) -> Drive:
         indices.numpy()
         for indices in (kinematics.pmodel_active_joint_indices, kinematics.pmodel_controlled_joint_indices)
     )
-    scaled = _pose_scaling(controller)
+    scaled, at_base = _pose_scaling(controller), _at_base(root.entity_pose)
+    # By its configuration: the robot's own root stands still, another link may move.
+    moving_base = config.root_link_name is not None
 
     def drive(action: FloatArray) -> None:
         position, rotation = scaled(action)
         if config.use_delta:
-            base = root.entity_pose
-            here_m, here = _at_base(base.p, base.q, tip.entity_pose)
+            here_m, here = (_at_base(root.entity_pose) if moving_base else at_base)(tip.entity_pose)
             position = here_m + position
             # ManiSkill also multiplies where the action does not turn the hand.
             rotation = _standard(_product((ONE, ZERO, ZERO, ZERO) if rotation is None else rotation, here))
@@ -155,9 +157,11 @@ def _pose_scaling(controller: Any) -> Callable[[FloatArray], tuple[FloatArray, Q
 
     def scaled(action: FloatArray) -> tuple[FloatArray, Quaternion]:
         turn = action[3:]
-        norm = torch.linalg.norm(torch.from_numpy(turn)[None], dim=1).numpy()[0]
-        if norm > 1:
-            turn = turn * (ONE / norm)
+        x, y, z = turn.tolist()
+        if x * x + y * y + z * z > SURELY_SHORT:  # torch's norm is asked only where it could be above 1
+            norm = torch.linalg.norm(torch.from_numpy(turn)[None], dim=1).numpy()[0]
+            if norm > 1:
+                turn = turn * (ONE / norm)
         return translation(action[:3]), _from_euler(turn * unit_rad)
 
     return scaled
@@ -196,12 +200,15 @@ def _rotated(q: Quaternion, point: Vector) -> FloatArray:
     return np.array(_product(_product(q, (ZERO, *point)), inverse)[1:], dtype=np.float32)
 
 
-def _at_base(base_m: FloatArray, base_wxyz: FloatArray, tip: sapien.Pose) -> tuple[FloatArray, Quaternion]:
-    """Return position and rotation of the tip in the frame of the base."""
-    w, x, y, z = base_wxyz
+def _at_base(base: sapien.Pose) -> Callable[[sapien.Pose], tuple[FloatArray, Quaternion]]:
+    """Return what turns a pose into position and rotation in the frame of the base."""
+    w, x, y, z = base.q
     inverse = (w, -x, -y, -z)
-    offset = _rotated(inverse, tuple(-base_m))
-    return offset + _rotated(inverse, tuple(tip.p)), _standard(_product(inverse, tuple(tip.q)))
+    offset = _rotated(inverse, tuple(-base.p))
+    return lambda tip: (
+        offset + _rotated(inverse, tuple(tip.p)),
+        _standard(_product(inverse, tuple(tip.q))),
+    )
 
 
 def _from_euler(angles_rad: FloatArray) -> Quaternion:
