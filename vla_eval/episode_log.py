@@ -56,7 +56,8 @@ class EpisodeLog:
         self.status = result.status
         self._note_reach(result)
         self.episode_return += result.reward
-        self.n_clipped_steps += bool(np.any(action < action_spec.low) or np.any(action > action_spec.high))
+        bounds = zip(action.tolist(), action_spec.low, action_spec.high, strict=True)
+        self.n_clipped_steps += not all(low <= number <= high for number, low, high in bounds)
         self.digest.update(np.ascontiguousarray(action, dtype="<f4").tobytes())
         self._digest_state(result)
         if result.status.success and self.success_step is None:
@@ -115,9 +116,9 @@ class EpisodeLog:
             self.tcp_reach_m = max(self.tcp_reach_m or 0.0, distance_m)
 
     def _check_finite(self, result: StepResult) -> None:
-        values = {"reward": np.asarray(result.reward), **result.observation.state}
+        values = {"reward": np.float64(result.reward), **result.observation.state}
         for name, value in values.items():
-            if not np.isfinite(value).all():
+            if np.count_nonzero(np.isfinite(value)) < value.size:
                 raise SimulationError(
                     f"{self.start.task}, seed {self.start.seed}, step {self.n_steps}: expected a finite "
                     f"'{name}', found {value}. The simulation diverged; please report seed and policy."

@@ -8,7 +8,7 @@ import pytest
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POS, EE_DELTA_POSE, EE_POSE, JOINT_POS
-from vla_eval.core import EpisodeStart
+from vla_eval.core import EpisodeStart, FloatArray
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameError
 from vla_eval.policies.context import PolicyContext
@@ -66,6 +66,30 @@ def test_the_arm_moves_as_with_maniskill_s_own_controllers_to_the_last_bit(
         env.close()
     np.testing.assert_equal(states[0], states[1])
     assert np.ptp(states[0][:-1:2], axis=0).max() > 0.1, "the arm did not move"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_arms_that_step_together_move_as_each_does_alone_to_the_last_bit(mode: str) -> None:
+    space, n_slots, n_steps = CONTROL_MODES[mode], 3, 25
+    drawn = np.random.default_rng(1).uniform(space.low, space.high, (n_steps, n_slots, len(space.dims)))
+    actions = (drawn * 1.2).astype(np.float32)
+    actions[:, :, :3] *= np.array([1, 0.1, 0], dtype=np.float32)[:, None]  # long, short, no translation
+
+    def states(slots: tuple[int, ...]) -> dict[int, list[FloatArray]]:
+        env: Any = make_env(EnvSettings(task=TASK, kwargs={"control_mode": mode}, n_slots=n_slots))
+        env.reset({slot: 5 + slot for slot in slots}, render=False)
+        found: dict[int, list[FloatArray]] = {slot: [] for slot in slots}
+        for step in range(n_steps):
+            # The last episode ends before the others.
+            asked = {slot: actions[step, slot] for slot in slots if slot < n_slots - 1 or step < n_steps // 2}
+            for slot, result in env.step(asked, render=frozenset()).items():
+                found[slot] += [*result.observation.state.values(), env.joint_targets(slot)]
+        env.close()
+        return found
+
+    together = states((0, 1, 2))
+    np.testing.assert_equal(together, states((0,)) | states((1,)) | states((2,)))
+    assert not np.array_equal(together[0][0], together[1][0])
 
 
 @pytest.mark.parametrize("mode", MODES)

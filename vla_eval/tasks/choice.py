@@ -12,10 +12,18 @@ from mani_skill.utils.structs import Actor
 from numpy.typing import NDArray
 
 from vla_eval.core import FloatArray
-from vla_eval.task_state import PrivilegedState, TaskStatus, only_one
+from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus, only_one
 from vla_eval.tasks.memory_env import MemoryTableEnv, Wxyz, nearness, poses
 from vla_eval.tasks.objects import limits
-from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere, length, positions_of
+from vla_eval.tasks.objects.bodies import (
+    Flags,
+    Indices,
+    Steps,
+    anywhere,
+    length,
+    position_of_one,
+    positions_of,
+)
 from vla_eval.tasks.objects.layout import places_from_right
 from vla_eval.tasks.objects.limits import Positive, StepCount
 from vla_eval.tasks.tensors_out import Info
@@ -38,6 +46,8 @@ class ChoiceEnv(MemoryTableEnv):
     """
 
     REACH_SCALE_PER_M: float
+    touch_height_m = 0.0
+    """Height of the point to touch over a candidate's centre."""
     candidates: list[Actor]
     in_order = False
     """Whether right candidates, if there are several, must be touched in the order of `right_candidates`."""
@@ -94,7 +104,16 @@ class ChoiceEnv(MemoryTableEnv):
 
     def touch_points_m(self) -> FloatArray:
         """Return (B, N, 3): the points that the tool centre point must come near, world frame."""
-        return self.candidate_positions_m()
+        return self._raised(self.candidate_positions_m())
+
+    def target_point_m(self) -> FloatArray:
+        """Return (B, 3): the one of `touch_points_m` that is right now."""
+        return self._raised(position_of_one(self.candidates, self.target_index()))
+
+    def _raised(self, points_m: FloatArray) -> FloatArray:
+        if self.touch_height_m:
+            points_m[..., 2] += self.touch_height_m
+        return points_m
 
     def target_index(self) -> Indices:
         """Return (B,) the index of the candidate that is right now."""
@@ -121,7 +140,7 @@ class ChoiceEnv(MemoryTableEnv):
 
     def target_distance_m(self) -> FloatArray:
         """Return (B,) the distance from the tool centre point to the point to touch."""
-        return length(self._of_target(self.touch_points_m()) - self.tcp_position_m())
+        return length(self.target_point_m() - self.tcp_position_m())
 
     def _of_target(self, per_candidate: NDArray[Any]) -> NDArray[Any]:
         found: NDArray[Any] = per_candidate[self._rows, self.target_index()]
@@ -167,7 +186,7 @@ class ChoiceEnv(MemoryTableEnv):
         placed = self.is_placed(reach_m)
         success = self.gated(placed & static)
         n_wrong = self._touched_wrongly.sum(axis=1)
-        lost = (n_wrong > 0) if self.strict_choice else np.zeros_like(success)
+        lost = (n_wrong > 0) if self.strict_choice else np.zeros(self.num_envs, dtype=np.bool_)
         return {
             "success": success & ~lost,
             "fail": lost,
@@ -180,13 +199,14 @@ class ChoiceEnv(MemoryTableEnv):
 
     def extra_info(self) -> Info:
         """Return the way from the tool centre point to the point to touch, as the official code calls it."""
-        return {"obj_to_goal_pos": self._of_target(self.touch_points_m()) - self.tcp_position_m()}
+        return {"obj_to_goal_pos": self.target_point_m() - self.tcp_position_m()}
 
     def status(self, info: Info, env: int) -> TaskStatus:
         """Return the status, with what was chosen and what is right."""
         first, right = int(info["first_choice"][env]), self.right_candidates(env)
-        return replace(
-            super().status(info, env),
+        return TaskStatus(
+            phase=PHASES[int(info["phase"][env])],
+            success=bool(info["success"][env]),
             fail=bool(info["fail"][env]),
             target=only_one(right),
             n_candidates=len(self.candidates),
@@ -221,12 +241,14 @@ class ChoiceEnv(MemoryTableEnv):
         placed = info["is_obj_placed"]
         return {
             "reaching": nearness(self.REACH_SCALE_PER_M, info["target_distance_m"]),
-            "slowing": self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed()) * placed,
+            "slowing": self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed()) * (placed | self.SLOWS_ANYWHERE),
             "resting": self.RESTING_WEIGHT * (info["is_robot_static"] & placed),
         }
 
     SLOWING_WEIGHT = 1.0
     RESTING_WEIGHT = 1.0
+    SLOWS_ANYWHERE = False
+    """Whether slowing down is rewarded also away from the right candidate."""
 
     def reveal(self, mask: Flags, orientation_wxyz: FloatArray | Wxyz) -> None:
         """Move all candidates to their slots where the mask holds; orientation is (4,) or (B, 4)."""

@@ -35,7 +35,7 @@ from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS, Arm
 from vla_eval.tasks.arm.robots import ParsedArms, kept_loader
 from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, checked_image_size, step_range
 from vla_eval.tasks.objects import limits
-from vla_eval.tasks.objects.bodies import Body, Flags, Indices, Steps, anywhere, velocity_of
+from vla_eval.tasks.objects.bodies import Body, Flags, Indices, Steps, anywhere, place, velocity_of
 from vla_eval.tasks.objects.limits import NotNegative, Positive
 from vla_eval.tasks.tensors_out import Info, TensorsOut
 
@@ -305,6 +305,9 @@ class MemoryTableEnv(TensorsOut):
         """
         if not anywhere(mask):
             return
+        if not self.gpu_sim_enabled:  # one environment, its actor without a tensor
+            place(actor, poses if isinstance(poses, sapien.Pose) else sapien.Pose(poses[0, :3], poses[0, 3:]))
+            return
         with self._only(mask):
             if isinstance(poses, sapien.Pose):
                 actor.set_pose(poses)
@@ -375,9 +378,11 @@ class MemoryTableEnv(TensorsOut):
 
     def dense_reward(self, terms: Info, info: Info) -> FloatArray:
         """Return the (B,) sum of the terms, or `MAX_REWARD` where the success rule holds."""
-        total = sum(term.astype(np.float32) for term in terms.values())
-        reward: FloatArray = np.where(info["success"], np.float32(self.MAX_REWARD), total)
-        return reward
+        total: FloatArray = np.zeros(self.num_envs, dtype=np.float32)
+        for term in terms.values():
+            total += term.astype(np.float32, copy=False)
+        total[info["success"]] = self.MAX_REWARD
+        return total
 
     def normalized_reward(self, info: Info) -> FloatArray:
         """Return the (B,) dense reward of the present step, divided by its value at success."""

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from vla_eval.seeding import Stream
 from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.item_choice import ItemChoiceEnv
-from vla_eval.tasks.memory_env import nearness
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere
 from vla_eval.tasks.objects.item_names import MIXED_SHAPE_NAMES, N_MIXED_COLORS
@@ -52,6 +51,7 @@ class RememberEnv(ItemChoiceEnv):
     REACH_SCALE_PER_M = 10.0
     SLOWING_WEIGHT = 0.5
     RESTING_WEIGHT = 0.5
+    SLOWS_ANYWHERE = True  # official code
 
     def __init__(self, *args: Any, goal_threshold_m: Positive = 0.05, **kwargs: Any) -> None:
         """Set the threshold of these tasks and build the scene."""
@@ -72,6 +72,8 @@ class RememberEnv(ItemChoiceEnv):
         return limits.n_swaps(n_items=self.n_items)
 
     def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
+        if not anywhere(step <= self._response_step):  # most steps of an episode
+            return False
         cue_begins = mask & (step == self.cue_after_steps) & (self._cue_end_step > step) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
@@ -80,12 +82,6 @@ class RememberEnv(ItemChoiceEnv):
         distracts = self._distract(step, mask)
         self._reveal_all(choice_begins)
         return anywhere(cue_begins | cue_ends | distracts | choice_begins)
-
-    def reward_terms(self, info: Info) -> Info:
-        """As in `ChoiceEnv`, but slowing down is rewarded everywhere (official code)."""
-        terms = super().reward_terms(info)
-        terms["slowing"] = self.SLOWING_WEIGHT * nearness(5.0, self.arm_speed())
-        return terms
 
     def _privileged_extra(self) -> Info:
         positions = self.candidate_positions_m()

@@ -10,7 +10,6 @@ import numpy as np
 import sapien
 from numpy.typing import NDArray
 
-from vla_eval.core import FloatArray
 from vla_eval.seeding import Stream
 from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.memory_env import Place, nearness
@@ -122,7 +121,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         )
         self.n_shown, self.gap_steps, self.dwell_steps = n_shown, gap_steps, dwell_steps
         self.swap_order, self.shuffle_cue = swap_order, shuffle_cue
-        self._touch_height_m = cube_half_size_m + TOUCH_ABOVE_TOP_M
+        self.touch_height_m = cube_half_size_m + TOUCH_ABOVE_TOP_M
         shape = cube(cube_half_size_m)
         items = tuple(Item(shape, color) for color in COLORS[:n_items])
         super().__init__(*args, items=items, goal_threshold_m=goal_threshold_m, **kwargs)
@@ -188,6 +187,8 @@ class SeveralColorsEnv(ItemChoiceEnv):
         self._near_steps[mask] = 0
 
     def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
+        if not anywhere(step <= self._response_step):  # most steps of an episode
+            return False
         in_cue = mask & (step < self._cue_end_step) & self.show_cue
         cue_ends = mask & (step == self._cue_end_step) & (step > 0)
         choice_begins = mask & (step == self._response_step)
@@ -247,12 +248,6 @@ class SeveralColorsEnv(ItemChoiceEnv):
         return (int(self._seen_sequence[env, turn]),) if since < turn_steps - self.gap_steps else ()
 
     # ---------------------------------------------------------------- touches
-
-    def touch_points_m(self) -> FloatArray:
-        """Return (B, N, 3): half a centimetre over the tops of the cubes, world frame."""
-        points = self.candidate_positions_m()
-        points[:, :, 2] += self._touch_height_m
-        return points
 
     def right_candidates(self, env: int) -> tuple[int, ...]:
         """Return the cubes that were shown, in the order shown."""
@@ -319,7 +314,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
         positions = self.candidate_positions_m()
         following = self.target_index()
         extra: Info = {
-            "obj_to_goal_pos": self._of_target(self.touch_points_m()) - self.tcp_position_m(),
+            "obj_to_goal_pos": self.target_point_m() - self.tcp_position_m(),
             "oracle_info": self.oracle_info(),
         }
         for index in range(self.n_items):

@@ -146,7 +146,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         return to_array(self.agent.controller.controllers["arm"]._target_qpos)
 
     # ---------------------------------------------------------------- the three parts of a control step
-    # Environments that step together do each part in turn: what a part needs is then in the processor's caches.
+    # Environments that step together do each part in turn: what it needs is then in the processor's caches.
 
     def drive(self, actions: FloatArray) -> None:
         """Give (B, A) float32 actions to the arm's controllers: `executed_action` says what will be done.

@@ -7,7 +7,7 @@ ManiSkill's controllers take 43 % of a control step if there is one arm.
 Source: https://github.com/haosulab/ManiSkill/blob/628bbe64e2c925d9d543171361a86c4a4965c6e9/mani_skill/agents/controllers
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any  # ManiSkill is untyped: agents, controllers and links are Any here
 
 import numpy as np
@@ -23,6 +23,7 @@ from mani_skill.agents.controllers import (
 from vla_eval.core import FloatArray
 
 Number = np.float32
+Numbers = Sequence[Number] | FloatArray
 Quaternion = tuple[Number, Number, Number, Number]
 Vector = tuple[Number, Number, Number]
 Drive = Callable[[FloatArray], None]
@@ -150,8 +151,9 @@ def _pose_scaling(controller: Any) -> Callable[[FloatArray], tuple[FloatArray, Q
     if not isinstance(controller, PDEEPoseController):
         translation = _scaling(controller)
         return lambda action: (translation(action), None)
+    from_euler = _euler()
     if not controller._normalize_action:
-        return lambda action: (action[:3], _from_euler(action[3:]))
+        return lambda action: (action[:3], from_euler(action[3:]))
     translation = _scaling(controller, slice(3))
     unit_rad = np.float32(controller.config.rot_lower)
 
@@ -162,7 +164,7 @@ def _pose_scaling(controller: Any) -> Callable[[FloatArray], tuple[FloatArray, Q
             norm = torch.linalg.norm(torch.from_numpy(turn)[None], dim=1).numpy()[0]
             if norm > 1:
                 turn = turn * (ONE / norm)
-        return translation(action[:3]), _from_euler(turn * unit_rad)
+        return translation(action[:3]), from_euler(turn * unit_rad)
 
     return scaled
 
@@ -211,27 +213,42 @@ def _at_base(base: sapien.Pose) -> Callable[[sapien.Pose], tuple[FloatArray, Qua
     )
 
 
-def _from_euler(angles_rad: FloatArray) -> Quaternion:
-    """Return the rotation about x, then about the new y, then about the new z."""
-    angles = torch.from_numpy(angles_rad)
-    cx, cy, cz = torch.cos(angles).numpy()
-    sx, sy, sz = torch.sin(angles).numpy()
-    # The product of the three matrices: what is multiplied by 0 or 1 rounds nothing.
-    a, b = sx * sy, -cx * sy
-    m00, m01, m02 = cy * cz, cy * -sz, sy
-    m10, m11, m12 = a * cz + cx * sz, a * -sz + cx * cz, -sx * cy
-    m20, m21, m22 = b * cz + sx * sz, b * -sz + sx * cz, cx * cy
-    squares = np.array(
-        (ONE + m00 + m11 + m22, ONE + m00 - m11 - m22, ONE - m00 + m11 - m22, ONE - m00 - m11 + m22)
-    )
-    roots = torch.sqrt(torch.from_numpy(np.maximum(squares, ZERO))).numpy()
-    w, x, y, z = roots
-    rows = (
-        (w * w, m21 - m12, m02 - m20, m10 - m01),
-        (m21 - m12, x * x, m10 + m01, m02 + m20),
-        (m02 - m20, m10 + m01, y * y, m12 + m21),
-        (m10 - m01, m20 + m02, m21 + m12, z * z),
-    )
-    best = int(roots.argmax())
-    twice, row = np.float32(2) * max(roots[best], LEAST), rows[best]
-    return _standard((row[0] / twice, row[1] / twice, row[2] / twice, row[3] / twice))
+def _of_torch(function: Callable[..., object], n: int) -> Callable[[Numbers], FloatArray]:
+    """Return torch's function for n numbers, without new tensors: each answer overwrites the last."""
+    tensors = torch.zeros(n), torch.zeros(n)
+    given, found = (tensor.numpy() for tensor in tensors)
+
+    def apply(numbers: Numbers) -> FloatArray:
+        given[:] = numbers
+        function(tensors[0], out=tensors[1])
+        return found
+
+    return apply
+
+
+def _euler() -> Callable[[FloatArray], Quaternion]:
+    """Return what makes the rotation about x, then about the new y, then about the new z."""
+    cosine, sine, root = _of_torch(torch.cos, 3), _of_torch(torch.sin, 3), _of_torch(torch.sqrt, 4)
+
+    def from_euler(angles_rad: FloatArray) -> Quaternion:
+        cx, cy, cz = cosine(angles_rad)
+        sx, sy, sz = sine(angles_rad)
+        # The product of the three matrices: what is multiplied by 0 or 1 rounds nothing.
+        a, b = sx * sy, -cx * sy
+        m00, m01, m02 = cy * cz, cy * -sz, sy
+        m10, m11, m12 = a * cz + cx * sz, a * -sz + cx * cz, -sx * cy
+        m20, m21, m22 = b * cz + sx * sz, b * -sz + sx * cz, cx * cy
+        squares = (ONE + m00 + m11 + m22, ONE + m00 - m11 - m22, ONE - m00 + m11 - m22, ONE - m00 - m11 + m22)
+        roots = root([max(square, ZERO) for square in squares])
+        w, x, y, z = roots
+        rows = (
+            (w * w, m21 - m12, m02 - m20, m10 - m01),
+            (m21 - m12, x * x, m10 + m01, m02 + m20),
+            (m02 - m20, m10 + m01, y * y, m12 + m21),
+            (m10 - m01, m20 + m02, m21 + m12, z * z),
+        )
+        best = int(roots.argmax())
+        twice, row = np.float32(2) * max(roots[best], LEAST), rows[best]
+        return _standard((row[0] / twice, row[1] / twice, row[2] / twice, row[3] / twice))
+
+    return from_euler

@@ -76,17 +76,39 @@ def positions_of(bodies: Sequence[Any]) -> FloatArray:
     """Return (B, N, 3): the positions of actors, world frame."""
     if _on_gpu(bodies[0]):
         return np.stack([to_array(body.pose.p) for body in bodies], axis=1)
-    return np.array([_sapien_pose(body).p for body in bodies])[None]
+    return np.array([body._objs[0].pose.p for body in bodies])[None]
+
+
+def position_of_one(bodies: Sequence[Any], index: Indices) -> FloatArray:
+    """Return (B, 3): the position of the actor that has this (B,) index, world frame."""
+    if _on_gpu(bodies[0]):
+        positions: FloatArray = positions_of(bodies)[np.arange(len(index)), index]
+        return positions
+    return position_of(bodies[index[0]])
 
 
 def velocity_of(body: Any) -> FloatArray:
     """Return (B, 3): the linear velocity of an actor or a link, world frame; 0 for a kinematic actor."""
-    return to_array(body.linear_velocity)
+    if _on_gpu(body):
+        return to_array(body.linear_velocity)
+    velocity: FloatArray = body._bodies[0].linear_velocity[None]
+    return velocity
 
 
 def spin_of(body: Any) -> FloatArray:
     """Return (B, 3): the angular velocity of an actor or a link, world frame."""
-    return to_array(body.angular_velocity)
+    if _on_gpu(body):
+        return to_array(body.angular_velocity)
+    spin: FloatArray = body._bodies[0].angular_velocity[None]
+    return spin
+
+
+def place(actor: Any, pose: Any) -> None:
+    """Move an actor of a scene on the CPU, at rest, to a `sapien.Pose`."""
+    actor._objs[0].pose = pose
+    if actor.px_body_type == "dynamic":
+        body = actor._bodies[0]
+        body.linear_velocity = body.angular_velocity = np.zeros(3, dtype=np.float32)
 
 
 def length(vectors: FloatArray) -> FloatArray:
