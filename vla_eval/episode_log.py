@@ -116,7 +116,7 @@ class EpisodeLog:
             self.tcp_reach_m = max(self.tcp_reach_m or 0.0, distance_m)
 
     def _check_finite(self, result: StepResult) -> None:
-        values = {"reward": np.float64(result.reward), **result.observation.state}
+        values = {"reward": np.array(result.reward), **result.observation.state}
         for name, value in values.items():
             if np.count_nonzero(np.isfinite(value)) < value.size:
                 raise SimulationError(
