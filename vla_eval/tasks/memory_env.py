@@ -309,10 +309,8 @@ class MemoryTableEnv(TensorsOut):
             place(actor, poses if isinstance(poses, sapien.Pose) else sapien.Pose(poses[0, :3], poses[0, 3:]))
             return
         with self._only(mask):
-            if isinstance(poses, sapien.Pose):
-                actor.set_pose(poses)
-            else:
-                actor.set_pose(Pose.create(torch.as_tensor(poses[mask], device=self.device)))
+            one = isinstance(poses, sapien.Pose)
+            actor.set_pose(poses if one else Pose.create(torch.as_tensor(poses[mask], device=self.device)))
             if actor.px_body_type == "dynamic":
                 zero = torch.zeros(3, device=self.device)
                 actor.set_linear_velocity(zero)

@@ -44,7 +44,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     _response_step: Steps
 
     def step_count(self) -> Steps:
-        """Return (B,) the control steps since the reset; on the CPU simulator they go on counting."""
+        """Return (B,) the control steps since the reset; on the CPU simulator not a copy."""
         if self._counted is not self._elapsed_steps or self.gpu_sim_enabled:
             self._counted = self._elapsed_steps
             self._count = self._counted.cpu().numpy()
