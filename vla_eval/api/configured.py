@@ -5,10 +5,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any  # plain data, whatever the user gives
 
-from vla_eval.config.files import Folder, load_recipe, to_data
+from vla_eval.config.files import Folder, to_data
 from vla_eval.errors import RecipeError, check_names
-from vla_eval.strict.decoding import decode
-from vla_eval.tasks.catalog import with_version
+from vla_eval.tasks.configured import read_configured
 
 
 def configured[C](
@@ -41,21 +40,19 @@ def configured[C](
     def complete(data: dict[str, Any]) -> None:
         data.update({name: value for name, value in given.items() if value is not None})
         edit(data)
-        if isinstance(data.get("tasks"), list):  # anything else is refused when it is decoded
-            data["tasks"] = [with_version(one) if isinstance(one, str) else one for one in data["tasks"]]
 
-    if isinstance(config, (str, Path)):
-        return load_recipe(folder, str(config), cls, edit=complete).value
-    data = dict(start) if config is None else to_data(config)
-    complete(data)
-    check_names("field", data, [one.name for one in fields(cls)], where=where)  # type: ignore[arg-type]
-    missing = [argument for field, argument in needed.items() if field not in data]
-    if missing:
-        raise RecipeError(
-            f"{where}: `{missing[0]}` is missing. Expected a configuration, or at least "
-            f"{' and '.join(needed.values())}: vla_eval.{where}({EXAMPLES[where]})"
-        )
-    return decode(cls, data, where=where)
+    def check(data: dict[str, Any]) -> None:
+        check_names("field", data, [one.name for one in fields(cls)], where=where)  # type: ignore[arg-type]
+        missing = [argument for field, argument in needed.items() if field not in data]
+        if missing:
+            raise RecipeError(
+                f"{where}: `{missing[0]}` is missing. Expected a configuration, or at least "
+                f"{' and '.join(needed.values())}: vla_eval.{where}({EXAMPLES[where]})"
+            )
+
+    file = str(config) if isinstance(config, (str, Path)) else None
+    fields_of = start if config is None or isinstance(config, (str, Path)) else to_data(config)
+    return read_configured(cls, file, folder=folder, start=fields_of, edit=complete, check=check, where=where)
 
 
 EXAMPLES = {

@@ -10,7 +10,7 @@ import yaml
 from vla_eval.checkpoints.notes import LEROBOT_ADAPTER
 from vla_eval.config.environment import RenderSettings, Simulator
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.config.files import check_run_name, load_recipe, recipe_fields
+from vla_eval.config.files import check_run_name, recipe_fields
 from vla_eval.config.finetuning import FinetuneConfig, merge_fields
 from vla_eval.config.policy import load_policy
 from vla_eval.errors import RecipeError, check_names
@@ -24,6 +24,7 @@ from vla_eval.strict.bounds import (
     check_seeds,
 )
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.configured import read_configured
 
 Trained = Literal["all", "adapters", "heads"]
 
@@ -171,7 +172,7 @@ def is_model_table(name: str) -> bool:
 
 def load_model_table(name: str) -> ModelTable:
     """Read a table; errors are those of `load_recipe`."""
-    return load_recipe("configs", name, ModelTable).value
+    return read_configured(ModelTable, name, folder="configs")
 
 
 def finetunings(table: ModelTable, out: Path) -> tuple[Finetuning, ...]:

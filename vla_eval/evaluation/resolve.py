@@ -12,7 +12,6 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.recipe import bare_policy
 from vla_eval.storage.shard import Shard, shard_folder
-from vla_eval.tasks.catalog import with_version
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
 
@@ -43,7 +42,6 @@ class ResolvedEvaluation:
         shard: Shard | None = None,
     ) -> Self:
         """Decide where policies infer; arguments as for `resolve`, with the policies that were read."""
-        config = replace(config, tasks=tuple(map(with_version, config.tasks)))
         if config.inference == "auto":
             config = replace(
                 config, inference="shared" if _shares(config, policies, backend) else "in_process"

@@ -14,7 +14,7 @@ from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.policies.remote.survey import survey, survey_address
 from vla_eval.storage.planned import named_checkpoints, part_of
-from vla_eval.tasks.catalog import task_spec, with_version
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.wire.addresses import named_server
 from vla_eval.wire.metadata import ServerMetadata
 
@@ -59,7 +59,7 @@ def load_policy_entry(text: str) -> PolicyEntry:
         if recipe.value.adapter == REMOTE_ADAPTER:
             raise _is_served(text, one)
     _check_alike(text, named.checkpoints, recipes)
-    task = None if named.task is None else task_spec(with_version(named.task)).id
+    task = None if named.task is None else task_spec(named.task).id
     return PolicyEntry(name=named.name, recipes=recipes, texts=named.checkpoints, is_by_run=True, task=task)
 
 

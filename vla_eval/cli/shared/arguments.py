@@ -11,12 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.slips import Several, numbers
-from vla_eval.config.files import Folder, load_recipe
+from vla_eval.config.files import Folder
 from vla_eval.errors import RecipeError
 from vla_eval.results.formats import FORMATS
 from vla_eval.storage.shard import Shard
 from vla_eval.strict.bounds import MAX_EPISODES, check_seeds
-from vla_eval.strict.decoding import decode
 from vla_eval.strict.renamed import warn_renamed
 
 if TYPE_CHECKING:
@@ -197,21 +196,16 @@ def read_config[T](
 
     Without a file, a field of `needed` that is missing is refused with its flag, `asks` and an `example`.
     """
-    from vla_eval.tasks.catalog import with_version
+    from vla_eval.tasks.configured import read_configured
 
-    def complete(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        edit(data)
-        if isinstance(data.get("tasks"), list):  # anything else is refused when it is decoded
-            data["tasks"] = [with_version(one) if isinstance(one, str) else one for one in data["tasks"]]
+    def check(data: dict[str, Any]) -> None:  # Any: plain data of YAML
+        for field, flag in needed.items():
+            if field not in data:
+                raise RecipeError(f"Name {asks}; {flag} is missing. Example: mikasa-vla {example}")
 
-    if name is not None:
-        return load_recipe(folder, name, cls, edit=complete).value
-    data = dict(start)
-    complete(data)
-    for field, flag in needed.items():
-        if field not in data:
-            raise RecipeError(f"Name {asks}; {flag} is missing. Example: mikasa-vla {example}")
-    return decode(cls, data, where="command line")
+    return read_configured(
+        cls, name, folder=folder, start=start, edit=edit, check=check, where="command line"
+    )
 
 
 def api_key_of(args: argparse.Namespace) -> str | None:
