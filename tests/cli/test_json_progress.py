@@ -11,6 +11,7 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines, PhaseLines
 from vla_eval.config.environment import EnvSettings
+from vla_eval.envs.factory import describe_env
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.plan import Plan
 from vla_eval.records import EpisodeError, EpisodeRecord
@@ -41,11 +42,14 @@ class Reader:
 
 
 def plan(n_episodes: int) -> Plan:
+    env = EnvSettings(task="RememberColor3-v0", kwargs={"horizon_steps": HORIZON_STEPS})
     group = EpisodeGroup(
         key=GroupKey("RememberColor3-v0", "p", 1),
         adapter="hold",
         args={},
-        env=EnvSettings(task="RememberColor3-v0", kwargs={"horizon_steps": HORIZON_STEPS}),
+        env=env,
+        offered=describe_env(env),
+        n_candidates=3,
         rollout=RolloutSettings(chunking=ChunkingSpec(n_action_steps=1)),
         instruction="i",
     )

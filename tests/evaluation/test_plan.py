@@ -10,6 +10,7 @@ from tests.config.eval_configs import config
 from tests.evaluation.resolved import fingerprint, make_plan, results_config
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import to_data
+from vla_eval.envs.factory import describe_env
 from vla_eval.errors import (
     MissingInstructionError,
     RecipeError,
@@ -17,9 +18,12 @@ from vla_eval.errors import (
     TaskArgumentError,
     UnknownNameError,
 )
+from vla_eval.evaluation import plan as planning
+from vla_eval.evaluation import worker
 from vla_eval.evaluation.job_queue import JobQueue
 from vla_eval.strict.decoding import decode
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.arguments import offered_by
+from vla_eval.tasks.catalog import TASKS, task_spec
 
 
 class TestPlan:
@@ -35,6 +39,28 @@ class TestPlan:
         assert len(keys) == len(set(keys)) == 24
         assert keys[0] == ("RememberColor3-v0", "random", 1, 0, 1)
         assert keys[-1] == ("ShellGameTouch-v0", "random", 4, 1, 3)
+
+    def test_an_environment_is_described_once_for_all_that_run_in_it(
+        self, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        described = []
+        for module in (planning, worker):
+            monkeypatch.setattr(
+                module,
+                "describe_env",
+                lambda env: described.append(env.task) or describe_env(env),
+                raising=False,
+            )
+        tasks = ["RememberColor5-v0", "ShellGameTouch-v0"]
+        plan = make_plan(config(tasks=tasks, policies=["random", "hold"], n_action_steps=[1, 4], episodes=2))
+
+        for group in (job.group for job in plan.jobs):
+            assert group.offered == offered_by(task_spec(group.key.task), {})
+            assert worker.make_policy(group).spec.name == group.key.policy
+        assert {job.group.key.task: job.group.n_candidates for job in plan.jobs} == dict(
+            zip(tasks, (5, 3), strict=True)
+        )
+        assert described == tasks
 
     def test_a_policy_that_needs_candidates_is_left_out_where_there_are_none(self) -> None:
         plan = make_plan(

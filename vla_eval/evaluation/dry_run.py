@@ -10,7 +10,6 @@ from vla_eval.checkpoints.files import find_checkpoint, weights_file
 from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
 from vla_eval.config.capture import may_be_wanted
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.envs.factory import describe_env
 from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.evaluation.evaluate import describe, worker_count
 from vla_eval.evaluation.job_queue import JobQueue
@@ -77,7 +76,7 @@ def evaluation_effort(
     finished = frozenset(record.key for record in records if record.error is None)
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)
-    steps = horizons(ahead)
+    steps = [job.group.offered.horizon_steps for job in ahead]
     inferences = [
         math.ceil(n_steps / job.group.key.n_action_steps) for job, n_steps in zip(ahead, steps, strict=True)
     ]
@@ -133,13 +132,6 @@ def _lines(resolved: ResolvedEvaluation, effort: EvaluationEffort, rates: Assume
         f"{rates.inference_seconds:g} s per inference of a learned policy, every worker busy to the end, no "
         "episode ends early; starting and loading not counted. The run's progress bar shows the real rate"
     )
-
-
-def horizons(jobs: Sequence[EpisodeJob]) -> list[int]:
-    """Return after how many control steps each episode ends at the latest."""
-    groups = {id(job.group): job.group for job in jobs}
-    steps = {key: describe_env(group.env).horizon_steps for key, group in groups.items()}
-    return [steps[id(job.group)] for job in jobs]
 
 
 def _checkpoints(plan: Plan) -> dict[str, Path]:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 from vla_eval.config.environment import EnvSettings
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
+from vla_eval.specs import EnvSpec
 
 
 class GroupKey(NamedTuple):
@@ -33,6 +34,8 @@ class EpisodeGroup:
     # the adapter's keyword arguments
     args: Mapping[str, Any]  # Any: whatever the adapter takes
     env: EnvSettings  # the environment, before it is known which cameras the policy needs
+    offered: EnvSpec  # what that environment provides, known without making it
+    n_candidates: int  # what the task lets one choose among; 0 where nothing is chosen
     rollout: RolloutSettings
     instruction: str
     # how many episodes a forward pass of the policy has room for: the slots of a worker where the policy

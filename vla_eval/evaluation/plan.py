@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain, product
 from typing import Any
 
@@ -156,8 +157,16 @@ def _groups_of_all(
     groups: list[EpisodeGroup] = []
     left_out: list[str] = []
     for task in tasks:
-        _check_changes(config, task, describe_env(_env_settings(config, task)))
-        instruction = sentences_of(prompts, task)[0]
+        env = _env_settings(config, task)
+        offered = describe_env(env)
+        _check_changes(config, task, offered)
+        on_task = partial(
+            EpisodeGroup,
+            env=env,
+            offered=offered,
+            n_candidates=task.n_candidates(config.env),
+            instruction=sentences_of(prompts, task)[0],
+        )
         for policy in (policy for policy in policies if policy.task in (None, task.id)):
             check_adapter(policy.value.adapter)
             if policy.value.needs_candidates and not task.has_candidates:
@@ -165,7 +174,7 @@ def _groups_of_all(
                 continue
             n_rows = config.inference_max_batch if policy.part(0) in shared else config.slots_per_worker
             server = servers.get(policy.name)
-            groups.extend(_groups(config, task, policy, instruction, server, n_rows=n_rows))
+            groups.extend(_groups(config, task, policy, server, on_task, n_rows=n_rows))
     return groups, left_out
 
 
@@ -342,8 +351,8 @@ def _groups(
     config: EvalConfig,
     task: TaskSpec,
     policy: PolicyEntry,
-    instruction: str,
     server: ServerMetadata | None,
+    on_task: partial[EpisodeGroup],
     *,
     n_rows: int,
 ) -> Iterable[EpisodeGroup]:
@@ -352,11 +361,10 @@ def _groups(
         if server is not None:
             args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare
             n_rows = server.batch_max or n_rows
-        yield EpisodeGroup(
+        yield on_task(
             key=GroupKey(task.id, policy.name, n_action_steps),
             adapter=recipe.value.adapter,
             args=args,
-            env=_env_settings(config, task),
             rollout=RolloutSettings(
                 chunking=config.chunking.at(n_action_steps),
                 eager_rendering=config.eager_rendering,
@@ -366,7 +374,6 @@ def _groups(
                     kind=config.cue_view, begins_at=config.env.get("cue_after_steps", 0)
                 ),
             ),
-            instruction=instruction,
             n_rows=n_rows,
             checkpoint=index if policy.is_by_run else None,
             part=policy.part(index),

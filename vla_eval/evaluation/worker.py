@@ -10,11 +10,10 @@ import gc
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, Policy, SimEnv, StepObserver, StepResult
-from vla_eval.envs.factory import describe_device, describe_env, make_env
+from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.errors import (
     InvalidActionError,
     RemoteConnectionError,
@@ -32,7 +31,6 @@ from vla_eval.records import EpisodeError, EpisodeRecord, EpisodeTiming
 from vla_eval.rollout import rollout
 from vla_eval.seeding import seed_global_generators
 from vla_eval.specs import EnvSpec, check_compatible
-from vla_eval.tasks.catalog import task_spec
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.viz.filming import film_again
 from vla_eval.viz.tape import EpisodeTape
@@ -60,13 +58,6 @@ class SentenceRead(Notice):
     part: str
     task: str
     reading: SentenceReading
-
-
-class EnvFacts(NamedTuple):
-    """What a policy gets to know of an environment before it is made."""
-
-    spec: EnvSpec
-    n_candidates: int
 
 
 class _StepCount(StepObserver):
@@ -159,7 +150,7 @@ class EpisodeRunner:
                 named,
                 env=env.spec,
                 heartbeat=self._heartbeat,
-                film=lambda tape: tape if self._is_live(group) else self._filmed(tape, group, env.spec),
+                film=lambda tape: tape if self._is_live(group) else self._filmed(tape, group),
             )
         return Finished(records=named, timings=timings)
 
@@ -167,11 +158,11 @@ class EpisodeRunner:
         """Whether images are captured while episodes run."""
         return self._capture is not None and not self._capture.config.films_afterwards(group.env.sim_backend)
 
-    def _filmed(self, tape: EpisodeTape, group: EpisodeGroup, spec: EnvSpec) -> EpisodeTape:
+    def _filmed(self, tape: EpisodeTape, group: EpisodeGroup) -> EpisodeTape:
         """Run an episode again, in an environment of its own that renders what is captured."""
         if self._filming_env is None:
             self._heartbeat("setup")
-            self._filming_env = make_env(dataclasses.replace(self._captured(group, spec), n_slots=1))
+            self._filming_env = make_env(dataclasses.replace(self._captured(group), n_slots=1))
         return film_again(tape, self._filming_env, self._heartbeat)
 
     def _tell_sentences(self, group: EpisodeGroup, policy: Policy) -> None:
@@ -185,32 +176,29 @@ class EpisodeRunner:
     def _prepare(self, job: EpisodeJob) -> tuple[SimEnv, Policy]:
         group = job.group
         if self._env is None or self._policy is None:
-            facts = EnvFacts(
-                describe_env(group.env), task_spec(group.env.task).n_candidates(group.env.kwargs)
-            )
             if self._capture is not None:
                 self._capture.load()
-            policy = make_policy(group, facts)
-            check_compatible(policy.spec, facts.spec)
+            policy = make_policy(group)
+            check_compatible(policy.spec, group.offered)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
             self._heartbeat("setup")
             # ManiSkill collects garbage at each reset, through all that the policy's libraries imported.
             gc.freeze()
-            self._env = self._make_env(self._settings_for(group, policy, facts), facts.spec)
+            self._env = self._make_env(self._settings_for(group, policy), group.offered)
             self._policy = policy
         return self._env, self._policy
 
-    def _settings_for(self, group: EpisodeGroup, policy: Policy, facts: EnvFacts) -> EnvSettings:
+    def _settings_for(self, group: EpisodeGroup, policy: Policy) -> EnvSettings:
         """Return what the policy needs; and what is captured, which the loop does not give to it."""
         if self._is_live(group):
-            return self._captured(group, facts.spec)
+            return self._captured(group)
         return dataclasses.replace(group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged)
 
-    def _captured(self, group: EpisodeGroup, spec: EnvSpec) -> EnvSettings:
+    def _captured(self, group: EpisodeGroup) -> EnvSettings:
         assert self._capture is not None
         return dataclasses.replace(
             group.env,
-            cameras=tuple(camera.name for camera in spec.cameras),
+            cameras=tuple(camera.name for camera in group.offered.cameras),
             privileged=True,
             human_camera_stride=self._capture.config.frame_stride,
         )
@@ -230,13 +218,13 @@ class EpisodeRunner:
         return env
 
 
-def make_policy(group: EpisodeGroup, facts: EnvFacts) -> Policy:
+def make_policy(group: EpisodeGroup) -> Policy:
     """Make the policy of a group; errors are those of `make_from_adapter`."""
     context = PolicyContext(
         name=group.key.policy,
-        env=facts.spec,
+        env=group.offered,
         chunking=group.rollout.chunking,
-        n_candidates=facts.n_candidates,
+        n_candidates=group.n_candidates,
         n_slots=group.env.n_slots,
     )
     return make_from_adapter(group.adapter, context, group.args)

@@ -14,10 +14,9 @@ from vla_eval.envs.fake import FakeEnv
 from vla_eval.errors import ConformanceError
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.resolve import ResolvedEvaluation
-from vla_eval.evaluation.worker import EnvFacts, make_policy
+from vla_eval.evaluation.worker import make_policy
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceWatch
 from vla_eval.policies.entries import PolicyEntry
-from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_policy import check_policy
 
 N_SLOTS = 2  # as many episodes as the check runs side by side
@@ -44,12 +43,11 @@ def check_recipe(
         say(line)
     group = plan.jobs[0].group
     shown = _Shown(replace(group.env, cameras=(), privileged=True))
-    facts = EnvFacts(shown.spec, task_spec(task).n_candidates(config.env))
-    first = make_policy(group, facts)
+    first = make_policy(group)
     made = [first]  # given to the check first: weights take long to load
     met = check_policy(
-        lambda: made.pop() if made else make_policy(group, facts),
-        facts.spec,
+        lambda: made.pop() if made else make_policy(group),
+        group.offered,
         observe=shown.observe if first.spec.privileged else None,
         instruction=group.instruction,
         report=report,

@@ -9,7 +9,6 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vla_eval.evaluation.dry_run import horizons
 from vla_eval.evaluation.plan import Plan
 from vla_eval.plain_text import printable
 from vla_eval.records import EpisodeKey, EpisodeRecord
@@ -120,9 +119,8 @@ class EvaluationLines(_Lines):
             return
         records = read_run(self._folder).records if n_finished else ()
         finished = {record.key: record.n_steps or 0 for record in records if record.error is None}
-        keys = (job.key for job in plan.jobs)
-        all_steps = zip(keys, horizons(plan.jobs), strict=True)
-        self._open_steps = {key: steps for key, steps in all_steps if key not in finished}
+        horizons = {job.key: job.group.offered.horizon_steps for job in plan.jobs}
+        self._open_steps = {key: steps for key, steps in horizons.items() if key not in finished}
         self._count.begin(
             n_done=n_finished,
             n_total=len(plan.jobs),

@@ -53,13 +53,14 @@ def _task_plan(
     recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSpec, instruction: str
 ) -> TaskPlan:
     env = EnvSettings(task=spec.id, kwargs=recipe.env, simulator=recipe.simulator, render=recipe.render)
-    describe_env(env)
     return TaskPlan(
         group=EpisodeGroup(
             key=GroupKey(spec.id, expert.name, 1),
             adapter=expert.value.adapter,
             args=expert.value.args,
             env=env,
+            offered=describe_env(env),
+            n_candidates=spec.n_candidates(recipe.env),
             rollout=RolloutSettings(
                 chunking=ONE_BY_ONE,
                 stop_at_success=recipe.cut == "after_success",

@@ -18,7 +18,6 @@ from vla_eval.data.manifest import (
     write_lines,
 )
 from vla_eval.data.recording.demonstrations import (
-    SLOT,
     Attempt,
     EpisodeLog,
     NoisyEnv,
@@ -39,7 +38,7 @@ from vla_eval.data.recording.jobs import (
 from vla_eval.data.recording.shard_writer import Format, ShardWriter, join_shards
 from vla_eval.data.simulator_runner import SimulatorRunner
 from vla_eval.errors import VlaEvalError
-from vla_eval.evaluation.worker import EnvFacts, make_policy
+from vla_eval.evaluation.worker import make_policy
 from vla_eval.features import CAMERA_KEYS, frame_values
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 from vla_eval.storage.durable import storage_full
@@ -80,9 +79,7 @@ class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
         plan = job.plan
         env = self._make_env(dataclasses.replace(plan.group.env, privileged=True))
         if self._expert is None:
-            self._heartbeat("reset")
-            status = env.reset({SLOT: job.seed}, render=False)[SLOT].status
-            self._expert = make_policy(plan.group, EnvFacts(env.spec, status.n_candidates))
+            self._expert = make_policy(plan.group)
         start = plan.start(job.seed, horizon_steps=env.spec.horizon_steps)
         noise = plan.recipe.action_noise
         acting: SimEnv = NoisyEnv(env, noise) if noise > 0 else env
