@@ -115,10 +115,17 @@ class Traps:
 
     def run(self, command: str, **environment: str) -> tuple[int, int, str]:
         """Return process id, exit code and output of a command."""
-        with self._started(command_line(command, self.work), **environment) as process:
+        with self.started(command_line(command, self.work), **environment) as process:
             assert process.stdout is not None
             said = process.stdout.read()
             return process.pid, process.wait(), said
+
+    def program(self, text: str) -> list[str]:
+        """Return what starts a program from a folder elsewhere, as a command is started."""
+        interpreter, command = command_line("", self.work)
+        program = Path(command).with_name("program")
+        program.write_text(text)
+        return [interpreter, str(program)]
 
     @contextlib.contextmanager
     def one_process(self) -> Iterator[Callable[[str, str | None], tuple[int, str]]]:
@@ -126,10 +133,7 @@ class Traps:
 
         A command that does not end runs in a fork, and is stopped when it has printed a word.
         """
-        interpreter, command = command_line("", self.work)
-        program = Path(command).with_name("one-after-another")
-        program.write_text(ONE_AFTER_ANOTHER)
-        with self._started([interpreter, str(program)], stdin=subprocess.PIPE) as process:
+        with self.started(self.program(ONE_AFTER_ANOTHER), stdin=subprocess.PIPE) as process:
             asked, answers = process.stdin, process.stdout
             assert asked is not None and answers is not None
 
@@ -151,7 +155,7 @@ class Traps:
             yield run
 
     @contextlib.contextmanager
-    def _started(
+    def started(
         self, command: list[str], *, stdin: int = subprocess.DEVNULL, **environment: str
     ) -> Iterator[subprocess.Popen[str]]:
         with subprocess.Popen(
@@ -200,7 +204,7 @@ def named(*, with_lerobot: bool) -> list[str]:
 @pytest.mark.parametrize(
     ("names", "each_alone"),
     [
-        pytest.param(named(with_lerobot=True), set(), id="with lerobot"),
+        pytest.param(named(with_lerobot=True), set(), id="with lerobot", marks=pytest.mark.slow),
         pytest.param(named(with_lerobot=False), set(), id="without it"),
         pytest.param(COMMANDS.keys(), COMMANDS.keys() - WITH_LEROBOT, id="all", marks=pytest.mark.slow),
     ],
@@ -224,6 +228,31 @@ def test_no_process_of_any_verb_imports_from_the_working_directory(
             if found := traps.caught():
                 caught[name] = sorted(found.values())
     assert caught == {}
+
+
+STARTS_OTHERS = """
+import subprocess, sys
+from vla_eval.cli.main import main
+from vla_eval.workers.children import python_command
+from vla_eval.workers.start import child_context
+
+if __name__ == "__main__":
+    assert main(["list", "tasks"]) == 0
+    child = child_context().Process(target=print, args=("a child imports vla_eval",))
+    child.start()
+    child.join()
+    assert child.exitcode == 0
+    for start in (python_command, lambda *rest: [sys.executable, *rest]):  # ours; a library's own
+        subprocess.run(start("-c", "import json, numpy, vla_eval.errors"), check=True)
+"""
+
+
+def test_no_process_of_any_kind_that_verbs_start_imports_from_the_working_directory(traps: Traps) -> None:
+    """Workers are those of the commands above; here: loaders, what `doctor` starts, what a library starts."""
+    with traps.started(traps.program(STARTS_OTHERS)) as process:
+        assert process.stdout is not None
+        said = process.stdout.read()
+    assert (process.returncode, traps.caught()) == (0, {}), said
 
 
 @pytest.mark.parametrize(
