@@ -128,6 +128,7 @@ EACH_IN_A_FORK = """
 import io, json, os, resource, sys
 import vla_eval.cli.main as cli
 import importlib
+import numpy  # which most commands load: once is enough
 for verb in cli.VERBS:
     importlib.import_module(f"vla_eval.cli.{verb}")  # what `mikasa-vla --help` loads
 heavy, commands = json.loads(sys.argv[1]), json.loads(sys.argv[2])

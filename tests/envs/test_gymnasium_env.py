@@ -184,7 +184,11 @@ def test_a_reset_without_a_seed_says_which_episode_it_is() -> None:
     np.testing.assert_array_equal(first["images"]["base_camera"], again["images"]["base_camera"])
 
 
-def test_the_page_on_gymnasium_works_as_scripts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("as_script", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_page_on_gymnasium_works(
+    as_script: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a script, processes that it spawns import the whole simulator again, each in seconds."""
     monkeypatch.chdir(tmp_path)
     blocks = [
         block.partition("```")[0] for block in PAGE.read_text(encoding="utf-8").split("```python\n")[1:]
@@ -192,7 +196,9 @@ def test_the_page_on_gymnasium_works_as_scripts(tmp_path: Path, monkeypatch: pyt
     assert len(blocks) == 4
     for block in blocks:
         small = block.replace("delay_steps=20", "delay_steps=2")
-        if "spawn" in block:  # its processes import the script
+        if "spawn" in block and not as_script:
+            exec(small.replace("num_envs=2", 'num_envs=2, simulator="fake"'), {"__name__": "__main__"})
+        elif "spawn" in block:  # its processes import the script
             (tmp_path / "script.py").write_text(small, "utf-8")
             subprocess.run([sys.executable, "script.py"], timeout=300, check=True)
         elif "num_envs=64" in block and not torch.cuda.is_available():

@@ -104,9 +104,6 @@ OF_GRIDS = ("probes", "delays", "cues", "first_inferences")
 def run(args: argparse.Namespace) -> int:
     """Run the evaluations, then print the table to standard output; everything else to standard error."""
     from vla_eval.probe.interventions import plan_probe
-    from vla_eval.probe.page.retention_plot import write_retention
-    from vla_eval.probe.probe_text import render_probe
-    from vla_eval.probe.table import read_probe
 
     if args.grid:
         return _run_grid(args)
@@ -118,6 +115,11 @@ def run(args: argparse.Namespace) -> int:
     stopped = _run_all([world.config for world in probe.worlds], args)
     if stopped is not None:
         return stopped
+    # What draws takes half a second to import, which a mistake need not wait for.
+    from vla_eval.probe.page.retention_plot import write_retention
+    from vla_eval.probe.probe_text import render_probe
+    from vla_eval.probe.table import read_probe
+
     table = read_probe(probe.worlds, args.out)
     for path in write_retention(table, args.out):
         print(f"retention curve: {path}", file=sys.stderr)
