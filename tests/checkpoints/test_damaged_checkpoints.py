@@ -156,7 +156,7 @@ def test_eval_says_what_is_wrong(
     assert "Traceback" not in said
 
 
-@pytest.mark.parametrize("file", [BEFORE, AFTER])
+@pytest.mark.parametrize("file", [BEFORE, pytest.param(AFTER, marks=pytest.mark.slow)])
 def test_a_step_of_any_family_is_taken_or_refused(whole: Path, tmp_path: Path, file: str) -> None:
     outcomes = set()
     for name in REGISTERED:

@@ -58,6 +58,8 @@ LEROBOTS = sorted(
     for kind in PreTrainedConfig.get_known_choices()
     if PreTrainedConfig.get_choice_class(kind).__module__.startswith("lerobot.policies.")
 )
+SAMPLE = ("act", "smolvla", "pi0_fast", "groot", "vla_jepa", "eo1")
+"""Families that find their backbones in different ways; the others are under the marker `slow`."""
 NAMES_FILES = re.compile("name|path|model|base|tokenizer|encoder|repo")
 BACKBONES = ("auto_map", "imports_are_copied_first", "pickled_weights", "adapter")
 TOKENIZERS = [
@@ -123,7 +125,9 @@ class TestTokenizers:
 class TestEveryField:
     """A backbone is a checkpoint of its own, whichever field of a configuration names it."""
 
-    @pytest.mark.parametrize("kind", LEROBOTS)
+    @pytest.mark.parametrize(
+        "kind", [pytest.param(kind, marks=() if kind in SAMPLE else pytest.mark.slow) for kind in LEROBOTS]
+    )
     def test_a_payload_that_a_field_names_leaves_no_trace(
         self, tmp_path: Path, trace: Path, cache: Path, kind: str
     ) -> None:

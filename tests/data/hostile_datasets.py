@@ -3,7 +3,7 @@
 import base64
 import dataclasses
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -61,15 +61,20 @@ def addresses(bait: Bait) -> dict[str, str]:
 
 def add_column(root: Path, table: str, name: str, column: pa.Array, kind: str | None) -> None:
     """Add a column to a table, or replace it, and say that it is of a type of `datasets`."""
+    add_columns(root, table, {name: column}, kind)
+
+
+def add_columns(root: Path, table: str, columns: Mapping[str, pa.Array], kind: str | None) -> None:
+    """The same with several at once."""
     path = root / table
     rows = pq.read_table(path)
-    if name in rows.column_names:
-        rows = rows.drop([name])
+    rows = rows.drop([name for name in columns if name in rows.column_names])
     plain = Features.from_arrow_schema(rows.schema.remove_metadata()).to_dict()
-    rows = rows.append_column(name, column)
+    for name, column in columns.items():
+        rows = rows.append_column(name, column)
     metadata = dict(rows.schema.metadata or {})
     if kind is not None:
-        features = {**plain, name: {"_type": kind}}
+        features = {**plain, **{name: {"_type": kind} for name in columns}}
         metadata[b"huggingface"] = json.dumps({"info": {"features": features}}).encode()
     pq.write_table(rows.replace_schema_metadata(metadata), path)
 

@@ -50,7 +50,7 @@ def assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
             assert ours[key] == value, key
 
 
-@pytest.mark.parametrize("storage", ["disk", "ram"])
+@pytest.mark.parametrize("storage", ["disk", pytest.param("ram", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "options",
     [

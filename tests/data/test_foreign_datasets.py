@@ -63,6 +63,9 @@ def read(root: Path, asked: Changes) -> Source:
     return prepare(find_source(root), asked)[0]
 
 
+@pytest.mark.parametrize(
+    "good", ["video", pytest.param("image", marks=pytest.mark.slow)], indirect=True, scope="module"
+)
 @settings(max_examples=N_PAIRS, derandomize=True, suppress_health_check=list(HealthCheck), deadline=None)
 @given(data=st.data())
 def test_any_dataset_is_read_right_or_refused_with_the_place(good: Path, data: st.DataObject) -> None:

@@ -25,6 +25,7 @@ from tests.data.hostile_datasets import (
     TASKS,
     Bait,
     add_column,
+    add_columns,
     addresses,
     as_struct,
     declare,
@@ -93,16 +94,20 @@ def test_no_column_of_any_type_is_opened(recorded: Path, bait: Bait, kind: str, 
 
 def test_no_protocol_that_is_installed_is_asked(recorded: Path, bait: Bait) -> None:
     assert len(addresses(bait)) > 30
-    for address in addresses(bait).values():
-        add_column(recorded, EPISODES, "evil", as_struct(address, n_rows(recorded, EPISODES)), "Image")
-        is_watching.set()
-        with pytest.raises(DatasetError, match="'evil' of the type"):
-            open_local_dataset(recorded)
-        is_watching.clear()
-        add_column(recorded, EPISODES, "evil", pa.array([address] * n_rows(recorded, EPISODES)), "Image")
-        is_watching.set()
-        assert open_local_dataset(recorded).meta.episodes[0]["evil"] == address
-        is_watching.clear()
+    columns = {f"evil {name}": address for name, address in addresses(bait).items()}
+    n = n_rows(recorded, EPISODES)
+    structs = {name: as_struct(address, n) for name, address in columns.items()}
+    add_columns(recorded, EPISODES, structs, "Image")
+    is_watching.set()
+    with pytest.raises(DatasetError, match=r"'evil .*' of the type"):
+        open_local_dataset(recorded)
+    is_watching.clear()
+    texts = {name: pa.array([address] * n) for name, address in columns.items()}
+    add_columns(recorded, EPISODES, texts, "Image")
+    is_watching.set()
+    row = open_local_dataset(recorded).meta.episodes[0]
+    is_watching.clear()
+    assert {name: row[name] for name in columns} == columns
 
 
 @pytest.mark.parametrize("scheme", ["reference", "http", "zip"])

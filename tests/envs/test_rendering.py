@@ -90,7 +90,7 @@ def run(env: Any, policy: SeeingPolicy, *, seed: int, eager: bool = False) -> tu
     return record, counting.n_rendered
 
 
-@pytest.mark.parametrize("chunk_size", [1, 4, 8])
+@pytest.mark.parametrize("chunk_size", [4, *(pytest.param(size, marks=pytest.mark.slow) for size in (1, 8))])
 def test_lazy_rendering_gives_the_frames_and_states_of_eager_rendering(env: Any, chunk_size: int) -> None:
     lazy, eager = SeeingPolicy(chunk_size), SeeingPolicy(chunk_size)
     lazy_record, n_lazy = run(env, lazy, seed=3)

@@ -111,7 +111,7 @@ def test_augmentation_depends_on_the_sample_alone(num_workers: int) -> None:
 
 
 @pytest.mark.parametrize("num_workers", [0, pytest.param(2, marks=pytest.mark.slow)])
-@pytest.mark.parametrize("stopped", [7, 9, 15])
+@pytest.mark.parametrize("stopped", [7, *(pytest.param(step, marks=pytest.mark.slow) for step in (9, 15))])
 def test_a_resumed_training_is_the_uninterrupted_one(
     recorded: Path, tmp_path: Path, killed_at: Any, small_act: None, num_workers: int, stopped: int
 ) -> None:

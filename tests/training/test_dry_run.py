@@ -210,7 +210,10 @@ PI0_FAST = PALIGEMMA + (2 * 257_152 - ROWS) * 2_048  # lerobot has the embedding
 
 @pytest.mark.parametrize(
     ("policy", "trained"),
-    [("smolvla", "99,880,992 of 450,046,176"), ("pi0_fast", f"{PI0_FAST:,} of {PI0_FAST:,}")],
+    [
+        ("smolvla", "99,880,992 of 450,046,176"),
+        pytest.param("pi0_fast", f"{PI0_FAST:,} of {PI0_FAST:,}", marks=pytest.mark.slow),
+    ],
 )
 @pytest.mark.usefixtures("no_network")
 def test_a_dry_run_needs_no_base_and_no_network(

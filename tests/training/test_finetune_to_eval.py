@@ -47,12 +47,21 @@ def tiny_recipes(folder: Path) -> dict[str, dict[str, Any]]:
     }
 
 
-def test_tiny_pi0_pi05_and_smolvla_go_from_a_dataset_to_a_table_in_worker_processes(
-    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    "families", [["smolvla"], pytest.param(["pi0", "pi05", "smolvla"], marks=pytest.mark.slow)], ids="-".join
+)
+def test_tiny_ones_go_from_a_dataset_to_a_table_in_worker_processes(
+    families: list[str],
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     runs: dict[str, Path] = {}
     with tiny_paligemma("pi0"), tiny_paligemma("pi05"):
-        for family, section in tiny_recipes(tmp_path).items():
+        recipes = tiny_recipes(tmp_path)
+        for family in families:
+            section = recipes[family]
             recipe = tmp_path / f"tiny_{family}.yaml"
             text = {
                 "version": 1,
@@ -88,12 +97,13 @@ def test_tiny_pi0_pi05_and_smolvla_go_from_a_dataset_to_a_table_in_worker_proces
         assert run.description.recipes[f"datasets/{dataset['name']}"] == dataset["sha256"]
         assert run.description.recipes[f"checkpoints/{family}-000002"] == checkpoint_sha256(folder)
     printed = capsys.readouterr()
-    assert "pi05-000002" in printed.out
+    assert "smolvla-000002" in printed.out
     warning = (
-        f"pi05-000002 was trained on demonstrations of 1 of the 2 seeds it is evaluated on in {TASK} (1001)"
+        "smolvla-000002 was trained on demonstrations of 1 of the 2 seeds it is evaluated on in "
+        f"{TASK} (1001)"
     )
     assert f"warning: {warning}" in printed.err  # before the first episode
     assert f"- {warning}" in printed.out  # below the table
-    assert "pi05-000002" in json.loads((out / "run.json").read_text())["training_seeds"]
+    assert "smolvla-000002" in json.loads((out / "run.json").read_text())["training_seeds"]
     assert main(["eval", *arguments, *FAKE, "--dry-run"]) == 0
     assert f"warning: {warning}" in capsys.readouterr().out

@@ -45,6 +45,8 @@ DOCS = Path(__file__).parents[2] / "docs" / "lerobot_policies.md"
 SHORT = {"steps": 2, "batch_size": 2, "save_every_steps": 2, "log_every_steps": 1, "num_workers": 0}
 ONE_IMAGE = "no: it takes one image, the datasets have two"
 ONE_KEY = "observation.image"
+TRAINED_ALIKE = {"pi0", "pi0_fast", "xvla", "multi_task_dit", "vqbet"}
+"""Types that take seconds and end as one in every run does: act, diffusion, pi05, smolvla or tdmpc."""
 pytestmark = pytest.mark.usefixtures("no_network")
 
 
@@ -160,7 +162,13 @@ def test_the_table_has_the_types_of_the_installed_lerobot() -> None:
     assert sorted(table()) == lerobots_types()
 
 
-@pytest.mark.parametrize("kind", lerobots_types())
+@pytest.mark.parametrize(
+    "kind",
+    [
+        pytest.param(kind, marks=pytest.mark.slow if kind in TRAINED_ALIKE else ())
+        for kind in lerobots_types()
+    ],
+)
 def test_the_table_says_what_becomes_of_each_type(
     kind: str, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -171,7 +179,13 @@ def test_the_table_says_what_becomes_of_each_type(
     assert table()[kind] == Outcome(found.trained, found.evaluated or "the same")
 
 
-@pytest.fixture(params=sorted(kind for kind, family in FAMILIES.items() if family.queues))
+@pytest.fixture(
+    params=[
+        pytest.param(kind, marks=pytest.mark.slow if kind in TRAINED_ALIKE else ())
+        for kind, family in sorted(FAMILIES.items())
+        if family.queues
+    ]
+)
 def by_step(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
     with built(request.param) as tiny:
         yield saved_by_lerobot(request.param, tiny, tmp_path / "model")

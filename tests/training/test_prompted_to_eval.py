@@ -65,7 +65,7 @@ def run(ported: Ported, checkpoint: Path, n_action_steps: int, **args: Any) -> A
     ("ported", "fields", "chunk"),
     [
         (OPENVLA, {"chunk_size": 4, "n_action_steps": 4}, 4),
-        (OPENVLA, {"chunk_size": 8, "n_action_steps": 8}, 8),
+        pytest.param(OPENVLA, {"chunk_size": 8, "n_action_steps": 8}, 8, marks=pytest.mark.slow),
         (SPATIALVLA, {"pictures": BOTH}, 4),
     ],
 )
@@ -91,7 +91,11 @@ def test_cameras_of_another_field_of_view_are_refused(recorded: Path, tmp_path: 
 
 
 @pytest.mark.parametrize(
-    ("ported", "plain", "fields", "alpha"), [(OPENVLA, PLAIN, OFT, 1), (SPATIALVLA, UNIFORM, REFITTED, 2)]
+    ("ported", "plain", "fields", "alpha"),
+    [
+        pytest.param(OPENVLA, PLAIN, OFT, 1, marks=pytest.mark.slow),
+        (SPATIALVLA, UNIFORM, REFITTED, 2),
+    ],
 )
 def test_an_adapter_merges_exactly(
     recorded: Path, tmp_path: Path, ported: Ported, plain: dict[str, Any], fields: dict[str, Any], alpha: int

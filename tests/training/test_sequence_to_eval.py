@@ -62,7 +62,13 @@ def chunks_of_an_episode(policy: Any) -> int:
     return record.n_inferences
 
 
-@pytest.mark.parametrize("recipe", RECIPES)
+@pytest.mark.parametrize(
+    "recipe",
+    [
+        pytest.param(name, marks=() if name in ("decision_transformer", "elmur") else pytest.mark.slow)
+        for name in RECIPES
+    ],
+)
 def test_it_is_trained_killed_resumed_to_the_same_weights_and_evaluated(
     recipe: str, recorded: Path, tmp_path: Path, killed_at: KilledAt
 ) -> None:
@@ -78,7 +84,7 @@ def test_it_is_trained_killed_resumed_to_the_same_weights_and_evaluated(
     assert chunks_of_an_episode(policy) == 5  # 10 steps, 2 actions each; the third segment has begun
 
 
-@pytest.mark.parametrize("recipe", ["rate", "elmur"])
+@pytest.mark.parametrize("recipe", ["rate", pytest.param("elmur", marks=pytest.mark.slow)])
 def test_episodes_in_one_pass_get_the_chunks_of_a_pass_of_their_own(
     recipe: str, recorded: Path, tmp_path: Path
 ) -> None:
@@ -110,7 +116,7 @@ def in_one_storage(cells: nn.RNNBase) -> None:
         weight.data = part.view_as(weight)
 
 
-@pytest.mark.parametrize("kind", ["gru", "lstm"])
+@pytest.mark.parametrize("kind", [pytest.param("gru", marks=pytest.mark.slow), "lstm"])
 def test_recurrent_weights_that_share_a_storage_are_saved_resumed_and_evaluated(
     kind: str, recorded: Path, tmp_path: Path, killed_at: KilledAt, monkeypatch: pytest.MonkeyPatch
 ) -> None:
