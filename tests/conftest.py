@@ -6,6 +6,7 @@ import os
 import shutil
 import socket
 from collections.abc import Callable, Generator, Iterator
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,8 @@ os.environ.setdefault("HF_HUB_OFFLINE", "1")
 # Read when torch is imported. Test processes share the cores: threads that wait took half of the time.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from vla_eval.workers.start import worker_context  # after the lines above
+from vla_eval.workers import start  # after the lines above
+from vla_eval.workers.start import worker_context
 
 gc.disable()  # while tests are collected: what a module makes stays
 
@@ -33,6 +35,31 @@ worker_context(
         "vla_eval.data.replaying.worker",
     )
 )
+
+
+_light_server, _light_preloaded = vars(forkserver.ForkServer()), dict[str, None]()
+
+
+@pytest.fixture(scope="module")
+def light_workers() -> Iterator[None]:
+    """Fork this module's workers from a second server, which has imported neither torch nor a simulator.
+
+    A fork of a small process takes a third of the time. A worker that needs more imports it itself.
+    """
+    server, others = vars(forkserver._forkserver), start._preloaded  # type: ignore[attr-defined]
+    for here, kept in ((server, _light_server), (others, _light_preloaded)):
+        _swap(here, kept)
+    yield
+    for here, kept in ((server, _light_server), (others, _light_preloaded)):
+        _swap(here, kept)
+
+
+def _swap(one: dict[str, Any], other: dict[str, Any]) -> None:
+    before = dict(one)
+    one.clear()
+    one.update(other)
+    other.clear()
+    other.update(before)
 
 
 @pytest.fixture

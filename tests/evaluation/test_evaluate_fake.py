@@ -19,6 +19,8 @@ from vla_eval.storage.run_folder import read_run
 from vla_eval.workers.load import Load
 from vla_eval.workers.local import LocalBackend
 
+pytestmark = pytest.mark.usefixtures("light_workers")
+
 bench = evaluation_bench.bench
 
 

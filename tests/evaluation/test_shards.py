@@ -16,6 +16,8 @@ from vla_eval.storage.merging import merge_runs, write_merged
 from vla_eval.storage.run_folder import read_run
 from vla_eval.storage.shard import Shard
 
+pytestmark = pytest.mark.usefixtures("light_workers")
+
 bench = evaluation_bench.bench
 
 # 7 seeds in blocks of 2: 1 2 | 3 4 | 5 6 | 7. Dealt out in turn to two shards.

@@ -19,6 +19,8 @@ from vla_eval.probe.phases import fixed_phases, inferences
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.tasks.catalog import task_spec
 
+pytestmark = pytest.mark.usefixtures("light_workers")
+
 TASK = "RememberColor3-v0"
 FAKE = ["--set", "simulator=fake", "--workers", "1"]
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
