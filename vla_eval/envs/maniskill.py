@@ -28,6 +28,7 @@ from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.appearance import with_appearance
 from vla_eval.tasks.arguments import ROBOT, check_arguments, horizon_steps, robot_uid
+from vla_eval.tasks.arm.arm_control import drive_together
 from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.memory_env import CueSize, MemoryTableEnv, Place
@@ -84,13 +85,11 @@ class ManiSkillEnv:
     def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
         """Execute one control step in each of the given slots; see `SimEnv.step`."""
         stepped = self._by_env(actions)
-        for index, _ in stepped:
-            first = index * self._slots_per_env
-            rows = [
-                actions[slot] if slot in actions else self.hold_action(slot)
-                for slot in range(first, first + self._slots_per_env)
-            ]
-            self._envs[index].drive(np.array(rows))
+        n = self._slots_per_env
+        slots_of_rows = (slot for index, _ in stepped for slot in range(index * n, (index + 1) * n))
+        rows = [actions[slot] if slot in actions else self.hold_action(slot) for slot in slots_of_rows]
+        if rows:
+            drive_together([self._envs[index] for index, _ in stepped], np.array(rows))
         for index, _ in stepped:
             self._envs[index].simulate()
         results: dict[int, StepResult] = {}

@@ -4,6 +4,7 @@ Arrays begin here: what ManiSkill keeps as tensors is read as numpy, (B, …) fl
 objects, rewards or what a task is about.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -149,22 +150,8 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     # Environments that step together do each part in turn: what it needs is then in the processor's caches.
 
     def drive(self, actions: FloatArray) -> None:
-        """Give (B, A) float32 actions to the arm's controllers: `executed_action` says what will be done.
-
-        Raises:
-            ValueError: an action is not a number.
-        """
-        if anywhere(np.isnan(actions)):
-            raise ValueError(f"An action is not a number: {actions.tolist()}.")
-        if self.freeze_until_choice or self.move_in_delay:
-            actions = self._replaced(actions)
-        space = self.single_action_space
-        self.executed_action = np.minimum(np.maximum(actions, space.low), space.high)
-        # ManiSkill clips only numbers that it scales.
-        self._driven_action = self.executed_action if self.control_mode in ABSOLUTE_MODES else actions
-        if not self.gpu_sim_enabled:
-            for part, drive in self._drives():
-                drive(self._driven_action[0, part])
+        """Give (B, A) float32 actions to the controllers, see `drive_together`."""
+        drive_together([self], actions)
 
     def simulate(self) -> None:
         """Let the time of one control step pass."""
@@ -214,3 +201,36 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
                 replaced[env] = 0
                 replaced[env, Y_DIMENSION], replaced[env, GRIPPER_DIMENSION] = motion
         return replaced
+
+
+def drive_together(envs: Sequence[ArmControl], actions: FloatArray) -> None:
+    """Give actions to the controllers of environments alike: `executed_action` says what will be done.
+
+    Args:
+        envs: one, or several on the CPU simulator.
+        actions: (N, A) float32, a row for each of their arms, in order.
+
+    Raises:
+        ValueError: an action is not a number.
+    """
+    if anywhere(np.isnan(actions)):
+        raise ValueError(f"An action is not a number: {actions.tolist()}.")
+    first, n_rows = envs[0], len(actions) // len(envs)
+    blocks = [slice(i * n_rows, (i + 1) * n_rows) for i in range(len(envs))]
+    if first.freeze_until_choice or first.move_in_delay:
+        actions = np.concatenate(
+            [env._replaced(actions[rows]) for env, rows in zip(envs, blocks, strict=True)]
+        )
+    space = first.single_action_space
+    executed = np.minimum(np.maximum(actions, space.low), space.high)
+    for env, rows in zip(envs, blocks, strict=True):
+        env.executed_action = executed[rows]
+    # ManiSkill clips only numbers that it scales.
+    driven = executed if first.control_mode in ABSOLUTE_MODES else actions
+    if first.gpu_sim_enabled:
+        first._driven_action = driven
+        return
+    for parts in zip(*(env._drives() for env in envs), strict=True):
+        part, shared = parts[0]
+        for (_, drive), goal in zip(parts, shared.goals(driven[:, part]), strict=True):
+            drive.reach(goal)

@@ -7,8 +7,8 @@ ManiSkill's controllers take 43 % of a control step if there is one arm.
 Source: https://github.com/haosulab/ManiSkill/blob/628bbe64e2c925d9d543171361a86c4a4965c6e9/mani_skill/agents/controllers
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any  # ManiSkill is untyped: agents, controllers and links are Any here
+from collections.abc import Callable, Iterable
+from typing import Any, NamedTuple  # ManiSkill is untyped: agents, controllers and links are Any here
 
 import numpy as np
 import sapien
@@ -23,11 +23,21 @@ from mani_skill.agents.controllers import (
 from vla_eval.core import FloatArray
 
 Number = np.float32
-Numbers = Sequence[Number] | FloatArray
 Quaternion = tuple[Number, Number, Number, Number]
 Vector = tuple[Number, Number, Number]
-Drive = Callable[[FloatArray], None]
-"""Sets the targets of the joints of one controller to its part of an action."""
+
+
+class Drive(NamedTuple):
+    """What drives the joints of one controller, in two parts: arms that step together share the first.
+
+    Attributes:
+        goals: (N, D), this controller's part of the actions of N arms alike -> a goal for each.
+        reach: sets the targets of this arm's joints by a goal.
+    """
+
+    goals: Callable[[FloatArray], Iterable[Any]]
+    reach: Callable[[Any], None]
+
 
 ZERO, ONE = np.float32(0), np.float32(1)
 LEAST = np.float32(0.1)  # of what quaternions are divided by
@@ -50,8 +60,12 @@ def _drive_of(controller: Any) -> Drive:
     plain = not getattr(config, "use_target", False) and not getattr(config, "interpolate", False)
     make = DRIVES.get(type(controller)) if plain and getattr(config, "frame", FRAME) == FRAME else None
     if make is None:
-        return lambda action: controller.set_action(torch.from_numpy(action)[None])
+        return _own_drive(controller)
     return make(controller)
+
+
+def _own_drive(controller: Any) -> Drive:
+    return Drive(list, lambda action: controller.set_action(torch.from_numpy(action)[None]))
 
 
 FRAME = "root_translation:root_aligned_body_rotation"
@@ -90,18 +104,15 @@ def _scaling(controller: Any, part: slice = slice(None)) -> Callable[[FloatArray
 
 
 def _joint_drive(controller: Any) -> Drive:
-    joints, scaled, is_delta = _Joints(controller), _scaling(controller), controller.config.use_delta
-
-    def drive(action: FloatArray) -> None:
-        targets = scaled(action)
-        joints.drive_to(joints.qpos() + targets if is_delta else targets.copy())
-
-    return drive
+    joints, is_delta = _Joints(controller), controller.config.use_delta
+    return Drive(
+        _scaling(controller), lambda goal: joints.drive_to(joints.qpos() + goal if is_delta else goal)
+    )
 
 
 def _mimic_drive(controller: Any) -> Drive:
     if controller.config.use_delta:
-        return lambda action: controller.set_action(torch.from_numpy(action)[None])
+        return _own_drive(controller)
     joints, scaled = _Joints(controller), _scaling(controller)
     controls = controller.control_joint_indices.numpy()
     mimics, of = controller.mimic_joint_indices.numpy(), controller.mimic_control_joint_indices.numpy()
@@ -110,7 +121,7 @@ def _mimic_drive(controller: Any) -> Drive:
     source[controls] = np.arange(len(controls))
     source[mimics] = source[of]
     multiplier[mimics], offset[mimics] = controller._multiplier.numpy(), controller._offset.numpy()
-    return lambda action: joints.drive_to(scaled(action)[source] * multiplier + offset)
+    return Drive(lambda actions: scaled(actions)[:, source] * multiplier + offset, joints.drive_to)
 
 
 def _pose_drive(controller: Any) -> Drive:
@@ -122,12 +133,12 @@ def _pose_drive(controller: Any) -> Drive:
         indices.numpy()
         for indices in (kinematics.pmodel_active_joint_indices, kinematics.pmodel_controlled_joint_indices)
     )
-    scaled, at_base = _pose_scaling(controller), _at_base(root.entity_pose)
+    at_base = _at_base(root.entity_pose)
     # By its configuration: the robot's own root stands still, another link may move.
     moving_base = config.root_link_name is not None
 
-    def drive(action: FloatArray) -> None:
-        position, rotation = scaled(action)
+    def reach(goal: tuple[FloatArray, Quaternion | None]) -> None:
+        position, rotation = goal
         if config.use_delta:
             here_m, here = (_at_base(root.entity_pose) if moving_base else at_base)(tip.entity_pose)
             position = here_m + position
@@ -143,30 +154,28 @@ def _pose_drive(controller: Any) -> Drive:
         )
         joints.drive_to(found[controlled].astype(np.float32) if success else qpos[joints._indices])
 
-    return drive
+    return Drive(_pose_goals(controller), reach)
 
 
-def _pose_scaling(controller: Any) -> Callable[[FloatArray], tuple[FloatArray, Quaternion | None]]:
-    """Return what turns an action into a translation and, where it has one, a rotation."""
+def _pose_goals(controller: Any) -> Callable[[FloatArray], Iterable[tuple[FloatArray, Quaternion | None]]]:
+    """Return what turns actions into translations and, where they have some, rotations."""
     if not isinstance(controller, PDEEPoseController):
         translation = _scaling(controller)
-        return lambda action: (translation(action), None)
-    from_euler = _euler()
+        return lambda actions: [(position, None) for position in translation(actions)]
     if not controller._normalize_action:
-        return lambda action: (action[:3], from_euler(action[3:]))
+        return lambda actions: list(zip(actions[:, :3], _from_euler(actions[:, 3:]), strict=True))
     translation = _scaling(controller, slice(3))
     unit_rad = np.float32(controller.config.rot_lower)
 
-    def scaled(action: FloatArray) -> tuple[FloatArray, Quaternion]:
-        turn = action[3:]
-        x, y, z = turn.tolist()
-        if x * x + y * y + z * z > SURELY_SHORT:  # torch's norm is asked only where it could be above 1
-            norm = torch.linalg.norm(torch.from_numpy(turn)[None], dim=1).numpy()[0]
-            if norm > 1:
-                turn = turn * (ONE / norm)
-        return translation(action[:3]), from_euler(turn * unit_rad)
+    def goals(actions: FloatArray) -> list[tuple[FloatArray, Quaternion]]:
+        turns = np.ascontiguousarray(actions[:, 3:])
+        # torch's norm is asked only where it could be above 1.
+        if any(x * x + y * y + z * z > SURELY_SHORT for x, y, z in turns.tolist()):
+            norms = torch.linalg.norm(torch.from_numpy(turns), dim=1, keepdim=True).numpy()
+            turns = turns * (ONE / np.maximum(norms, ONE))
+        return list(zip(translation(actions[:, :3]), _from_euler(turns * unit_rad), strict=True))
 
-    return scaled
+    return goals
 
 
 DRIVES: dict[type, Callable[[Any], Drive]] = {
@@ -213,42 +222,33 @@ def _at_base(base: sapien.Pose) -> Callable[[sapien.Pose], tuple[FloatArray, Qua
     )
 
 
-def _of_torch(function: Callable[..., object], n: int) -> Callable[[Numbers], FloatArray]:
-    """Return torch's function for n numbers, without new tensors: each answer overwrites the last."""
-    tensors = torch.zeros(n), torch.zeros(n)
-    given, found = (tensor.numpy() for tensor in tensors)
-
-    def apply(numbers: Numbers) -> FloatArray:
-        given[:] = numbers
-        function(tensors[0], out=tensors[1])
-        return found
-
-    return apply
-
-
-def _euler() -> Callable[[FloatArray], Quaternion]:
-    """Return what makes the rotation about x, then about the new y, then about the new z."""
-    cosine, sine, root = _of_torch(torch.cos, 3), _of_torch(torch.sin, 3), _of_torch(torch.sqrt, 4)
-
-    def from_euler(angles_rad: FloatArray) -> Quaternion:
-        cx, cy, cz = cosine(angles_rad)
-        sx, sy, sz = sine(angles_rad)
-        # The product of the three matrices: what is multiplied by 0 or 1 rounds nothing.
-        a, b = sx * sy, -cx * sy
-        m00, m01, m02 = cy * cz, cy * -sz, sy
-        m10, m11, m12 = a * cz + cx * sz, a * -sz + cx * cz, -sx * cy
-        m20, m21, m22 = b * cz + sx * sz, b * -sz + sx * cz, cx * cy
-        squares = (ONE + m00 + m11 + m22, ONE + m00 - m11 - m22, ONE - m00 + m11 - m22, ONE - m00 - m11 + m22)
-        roots = root([max(square, ZERO) for square in squares])
-        w, x, y, z = roots
-        rows = (
-            (w * w, m21 - m12, m02 - m20, m10 - m01),
-            (m21 - m12, x * x, m10 + m01, m02 + m20),
-            (m02 - m20, m10 + m01, y * y, m12 + m21),
-            (m10 - m01, m20 + m02, m21 + m12, z * z),
-        )
+def _from_euler(angles_rad: FloatArray) -> list[Quaternion]:
+    """Return for each of (N, 3) angles the rotation about x, then about the new y, then about the new z."""
+    angles = torch.from_numpy(np.ascontiguousarray(angles_rad))
+    turned = list(map(_multiples, torch.cos(angles).numpy(), torch.sin(angles).numpy()))
+    squares = np.array([[row[i] for i, row in enumerate(rows)] for rows in turned])
+    found = []
+    for rows, roots in zip(turned, torch.sqrt(torch.from_numpy(squares)).numpy(), strict=True):
         best = int(roots.argmax())
-        twice, row = np.float32(2) * max(roots[best], LEAST), rows[best]
-        return _standard((row[0] / twice, row[1] / twice, row[2] / twice, row[3] / twice))
+        row, root = list(rows[best]), roots[best]
+        row[best] = root * root
+        twice = np.float32(2) * max(root, LEAST)
+        found.append(_standard((row[0] / twice, row[1] / twice, row[2] / twice, row[3] / twice)))
+    return found
 
-    return from_euler
+
+def _multiples(cosines: Vector, sines: Vector) -> tuple[Quaternion, Quaternion, Quaternion, Quaternion]:
+    """Return the rotation, as a quaternion, times 4 w, times 4 x, times 4 y and times 4 z."""
+    (cx, cy, cz), (sx, sy, sz) = cosines, sines
+    # The product of the three matrices: what is multiplied by 0 or 1 rounds nothing.
+    a, b = sx * sy, -cx * sy
+    m00, m01, m02 = cy * cz, cy * -sz, sy
+    m10, m11, m12 = a * cz + cx * sz, a * -sz + cx * cz, -sx * cy
+    m20, m21, m22 = b * cz + sx * sz, b * -sz + sx * cz, cx * cy
+    wx, wy, wz, xy, xz, yz = m21 - m12, m02 - m20, m10 - m01, m10 + m01, m02 + m20, m12 + m21
+    return (
+        (max(ONE + m00 + m11 + m22, ZERO), wx, wy, wz),
+        (wx, max(ONE + m00 - m11 - m22, ZERO), xy, xz),
+        (wy, xy, max(ONE - m00 + m11 - m22, ZERO), yz),
+        (wz, xz, yz, max(ONE - m00 - m11 + m22, ZERO)),
+    )
