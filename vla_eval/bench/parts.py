@@ -25,6 +25,11 @@ class Part(NamedTuple):
     name: str
     cpu_ms: float
 
+    @property
+    def per_second(self) -> float:
+        """How many of them one core does in a second."""
+        return 1000 / self.cpu_ms
+
 
 def measure_parts(task: str, *, repeats: int) -> tuple[Part, ...]:
     """Measure a task on the CPU simulator, with random actions."""
@@ -77,4 +82,4 @@ def _cpu_ms(n: int, act: Callable[[int], object]) -> float:
 
 if __name__ == "__main__":
     for part in measure_parts(sys.argv[1] if len(sys.argv) > 1 else "RememberColor3-v0", repeats=3):
-        print(f"{part.cpu_ms:8.2f}  {part.name}")
+        print(f"{part.cpu_ms:8.2f} {part.per_second:6.0f}/s  {part.name}")

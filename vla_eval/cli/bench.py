@@ -145,10 +145,10 @@ def _rendering(args: argparse.Namespace) -> int:
             f"| {row.eager_cpu_ms:.1f} | {row.lazy_cpu_ms:.1f} | {row.cpu_speed_up:.1f} |"
         )
     print("States and actions of lazy and eager episodes were bit-equal.")
-    print("| part | CPU ms |")
-    print("|:--|--:|")
+    print("| part | CPU ms | per second and core |")
+    print("|:--|--:|--:|")
     for part in measure_parts(args.task, repeats=args.repeats):
-        print(f"| {part.name} | {part.cpu_ms:.2f} |")
+        print(f"| {part.name} | {part.cpu_ms:.2f} | {part.per_second:.0f} |")
     return 0
 
 
