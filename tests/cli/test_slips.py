@@ -46,6 +46,9 @@ SLIPS = {
     "record --task RememberColor3-v0 --set delay_steps=7": "Did you mean 'env.delay_steps'?",
     "probe --task RememberColor3-v0 --policy oracle --set delay_steps=7": "'env.delay_steps'",
     "finetune --policy act --dataset d --seed 1": "Did you mean '--run-seed'?",
+    "finetune --policy act --dataset d --set chunk_size=8": "Did you mean 'policy.chunk_size'?",
+    "finetune --policy act --dataset d --set optimizer_lr=1": "Did you mean 'policy.optimizer_lr'?",
+    "finetune --policy act --dataset d --set bath_size=8": "Did you mean 'batch_size'?",
     "finetune --policy act --dataset d --checkpoint c": "Did you mean '--base-checkpoint'?",
     "report runs/x --by K": "mikasa-vla compare RUN --by n_action_steps",
     "report runs/x --format tex": "Did you mean 'latex'?",
@@ -53,6 +56,22 @@ SLIPS = {
     "compare runs/x --by K": "Did you mean 'n_action_steps'?",
     "view runs/x --seed-start 3": "Did you mean '--seed'?",
     "list task": "Did you mean 'tasks'?",
+}
+
+
+SLIPS |= {  # a device that does not exist, wherever one is named
+    f"{line} {device}": f"expected auto, cpu, {words}"
+    for device in ("gpu", "cuda:x", "GPU")
+    for line, words in {
+        "finetune --policy act --dataset d --device": "cuda",
+        "finetune --policy act --dataset d --dry-run --device": "cuda",
+        "serve --policy act --device": "cuda",
+        "checkpoint verify d --device": "cuda",
+        "checkpoint rehearse act --device": "cuda",
+    }.items()
+} | {
+    f"{EVAL} --dry-run --set render.backend=vulkan": "expected auto, cpu, gpu, or a device",
+    "record --task RememberColor3-v0 --set render.backend=vulkan": "expected auto, cpu, gpu, or a device",
 }
 
 

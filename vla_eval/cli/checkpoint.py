@@ -13,6 +13,7 @@ from vla_eval.errors import MAX_SHOWN, CheckpointError
 from vla_eval.models.families import FAMILIES, bases
 from vla_eval.models.family import Family, imported
 from vla_eval.models.shared.options import Flag, flags_of
+from vla_eval.strict.devices import check_device
 
 DESCRIPTION = """verify: load a LeRobot checkpoint strictly (every tensor, shape and type), look for its
 statistics, and let it act once. It says nothing of how good the policy is.
@@ -42,7 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     verify = actions.add_parser("verify", help="load it strictly and let it act once", allow_abbrev=False)
     verify.add_argument("path", metavar="PATH", help="a LeRobot checkpoint, or a run of ours")
-    verify.add_argument("--device", default="cpu", metavar="D", help="auto, cpu, cuda (cpu)")
+    verify.add_argument("--device", type=check_device, default="cpu", metavar="D", help="auto, cuda (cpu)")
     verify.add_argument("--tokenizer", metavar="DIR", help="folder of the tokenizer")
     verify.add_argument("--verbose", action="store_true", help="name each statistic, not only their fields")
     for add in (_add_convert, _add_fetch, _add_merge, _add_rehearse):
@@ -96,7 +97,7 @@ def _add_rehearse(actions: "argparse._SubParsersAction[Any]") -> None:
         help="in policies/, with a `finetune` section; or a folder of a LeRobot checkpoint",
     )
     sub.add_argument("--dtype", choices=("float32", "bfloat16"), help="precision (the recipe's)")
-    sub.add_argument("--device", default="auto", metavar="D", help="auto, cpu, cuda (auto)")
+    sub.add_argument("--device", type=check_device, default="auto", metavar="D", help="cpu, cuda (auto)")
     sub.add_argument(
         "--out", type=Path, default=Path("rehearsal"), metavar="DIR", help="folder to use (rehearsal)"
     )

@@ -2,7 +2,10 @@
 
 import argparse
 import contextlib
+import re
 import sys
+from importlib.util import find_spec
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import (
@@ -162,6 +165,17 @@ def _done(summary: "FinetuneSummary") -> int:
     return 0
 
 
+def _policy_paths() -> dict[str, list[str]]:
+    """Return `chunk_size` -> `policy.chunk_size` of all fields of policies, for messages; without torch."""
+    names = set()
+    for package, pattern in (("lerobot", "policies/*"), ("vla_eval", "models/*")):
+        spec = find_spec(package)
+        for root in (spec.submodule_search_locations or ()) if spec else ():
+            for file in Path(root).glob(f"{pattern}/configuration_*.py"):
+                names |= set(re.findall(r"^    (\w+): ", file.read_text(encoding="utf-8"), re.MULTILINE))
+    return {name: [f"policy.{name}"] for name in names - set(FinetuneConfig.__annotations__)}
+
+
 def _config(args: argparse.Namespace) -> FinetuneConfig:
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("dataset", "run_seed", "device", "out"))
@@ -184,7 +198,8 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
             if value is not None:
                 set_field(FinetuneConfig, data, path, value, where="command line")
         if isinstance(data.setdefault("finetune", {}), dict):  # anything else is refused when it is decoded
-            apply_overrides(data["finetune"], args.overrides, cls=FinetuneRecipe)
+            free = _policy_paths() if args.overrides else {}
+            apply_overrides(data["finetune"], args.overrides, cls=FinetuneRecipe, free=free)
 
     if args.tasks is not None:
         raise RecipeError("--task is for a table of learned policies; otherwise the dataset says the task.")

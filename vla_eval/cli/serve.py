@@ -8,6 +8,7 @@ import sys
 
 from vla_eval.cli.shared.arguments import api_key_of, task_argument
 from vla_eval.errors import MAX_SHOWN
+from vla_eval.strict.devices import check_device
 from vla_eval.workers.start import WORKER_ENVIRONMENT
 
 DESCRIPTION = """Serve a policy over WebSocket, until Ctrl-C or SIGTERM. `mikasa-vla eval --policy ws://HOST:PORT`
@@ -42,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--n-action-steps", type=int, metavar="K", help="for scripted policies: actions of a chunk (1)"
     )
-    parser.add_argument("--device", metavar="D", help="auto, cpu, cuda, cuda:1 (as the recipe says)")
+    parser.add_argument(
+        "--device", type=check_device, metavar="D", help="auto, cpu, cuda, cuda:1 (the recipe's)"
+    )
     parser.add_argument("--debug", action="store_true", help="send errors with their traceback")
 
 

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
+from vla_eval.strict.devices import check_device
 
 SimBackend = Literal["cpu", "gpu"]
 HUMAN_CAMERA = "human_camera"
@@ -27,6 +28,9 @@ class RenderSettings:
 
     wrist_mesh: WristMesh = "shipped"
     backend: str = "auto"
+
+    def __post_init__(self) -> None:
+        check_device(self.backend, name="render.backend", renders=True)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -18,6 +18,7 @@ from vla_eval.strict.bounds import (
     check_bounds,
     check_seeds,
 )
+from vla_eval.strict.devices import check_device
 from vla_eval.strict.renamed import formerly
 
 Rank = Annotated[int, Bounds(1, 65_536)]  # of a LoRA adapter: no layer of these policies is wider
@@ -169,6 +170,7 @@ class FinetuneConfig:
 
     def __post_init__(self) -> None:
         check_seeds(self.run_seed, name="run_seed")
+        check_device(self.device)
 
 
 def merge_fields(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data

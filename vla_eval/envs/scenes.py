@@ -10,6 +10,7 @@ from vla_eval.core import ImageArray
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.envs.wrist_view import WRIST_CAMERA, WristView
 from vla_eval.errors import RenderingError
+from vla_eval.strict.devices import refuse_missing_gpu
 
 RENDERING_ADVICE = (
     "Run `mikasa-vla doctor`; on a machine without GPU, SAPIEN needs Mesa's lavapipe ≥ 24.3, which "
@@ -26,6 +27,7 @@ def render_backend(settings: EnvSettings) -> str:
         return "none"
     if settings.render.backend == "auto":
         return "sapien_cuda" if torch.cuda.is_available() else CPU_RENDERER
+    refuse_missing_gpu(torch.cuda.device_count(), {"render.backend": settings.render.backend})
     return {"cpu": CPU_RENDERER, "gpu": "sapien_cuda"}.get(settings.render.backend, settings.render.backend)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 from vla_eval.checkpoints.execution_fields import ignored_fields
 from vla_eval.checkpoints.notes import (
+    LEROBOT_CHECKPOINTS,
     checkpoint_hashes,
     known_chunk_size,
     normalization_notes,
@@ -33,6 +34,7 @@ from vla_eval.storage.planned import part_of
 from vla_eval.storage.shard import Shard
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.strict.bounds import MAX_EPISODES
+from vla_eval.strict.devices import check_device, refuse_missing_gpu
 from vla_eval.tasks.arguments import longest_wait_steps
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
@@ -103,6 +105,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     _refuse_doubles("policies", [part_of(one.name, task=one.task) for one in policies])
     _check_tasks(tasks, policies)
     _check_runs(config, policies)
+    _check_devices(resolved)
     prompts = load_prompts(config.prompt_set)
     servers = {policy.name: policy.server for policy in policies if policy.server is not None}
     shared = resolved.shared
@@ -248,6 +251,20 @@ def _check_tasks(tasks: Sequence[TaskSpec], policies: Sequence[PolicyEntry]) -> 
                 f"policies: '{policy.name}' is named twice, once for all tasks and once for "
                 f"{some_of(filter(None, own))}. Give the two different names."
             )
+
+
+def _check_devices(resolved: ResolvedEvaluation) -> None:
+    """Refuse a device that does not exist or is not there, for simulator, renderer or policies."""
+    config = resolved.config
+    recipes = [(one.name, recipe.value) for one in resolved.policies for recipe in one.recipes]
+    asked = {
+        (where := f"policy '{name}': args.device"): check_device(str(recipe.args["device"]), name=where)
+        for name, recipe in recipes
+        if recipe.adapter in LEROBOT_CHECKPOINTS and "device" in recipe.args
+    }
+    if config.simulator != "fake":
+        asked |= {"sim_backend": config.sim_backend, "render.backend": config.render.backend}
+    refuse_missing_gpu(resolved.backend.n_gpus, asked)
 
 
 def _check_changes(config: EvalConfig, task: TaskSpec, env: EnvSpec) -> None:

@@ -20,7 +20,6 @@ from vla_eval.tasks.interface import (
     IMAGE_SIZE,
     StepRange,
     cameras,
-    checked_image_size,
     states,
     step_range,
 )
@@ -67,8 +66,6 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[
             f"without it, in a run of its own."
         )
     action_spec(control_mode_of(given))
-    if IMAGE_SIZE in given:
-        checked_image_size(given[IMAGE_SIZE], task=spec.id)
     if spec.is_official:
         return
     _check_names_and_types(spec, given)
@@ -193,12 +190,13 @@ def offered_by(spec: TaskSpec, given: Mapping[str, object]) -> EnvSpec:
         TaskArgumentError: the arguments are impossible.
         UnknownNameError: there is no such control mode.
     """
+    size_px = given.get(IMAGE_SIZE)
     arm = ARMS.get(str(given.get(ROBOT)), ARMS[WRIST_MESH_ROBOTS["shipped"]])
     prompt_dims = None if spec.is_official else class_constant(spec.entry_point, "PROMPT_DIMS")
     wait = 0 if spec.is_official else longest_wait_steps(spec, given)
     return EnvSpec(
         task=spec.id,
-        cameras=cameras(checked_image_size(given.get(IMAGE_SIZE, IMAGE_SIZE_PX), task=spec.id)),
+        cameras=cameras(size_px if isinstance(size_px, int) else IMAGE_SIZE_PX),
         states=states(arm.joints, prompt_dims if isinstance(prompt_dims, tuple) else ()),
         action=action_spec(control_mode_of(given)),
         horizon_steps=horizon_steps(spec, wait, given.get(HORIZON)),

@@ -11,7 +11,7 @@ from vla_eval.control_modes import EE_DELTA_POSE, action_spec
 from vla_eval.errors import TaskArgumentError
 from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES, POSE_NAMES
 from vla_eval.specs import CameraSpec, EnvSpec, StateSpec
-from vla_eval.strict.bounds import MAX_IMAGE_SIZE_PX, MAX_STEPS, MIN_IMAGE_SIZE_PX
+from vla_eval.strict.bounds import MAX_STEPS
 
 IMAGE_SIZE = "image_size"
 """Name of the argument in `env`: height and width of the images of both cameras, in pixels."""
@@ -21,20 +21,6 @@ CONTROL_HZ = 20.0
 ACTION = action_spec(EE_DELTA_POSE)
 ANY_TASK = "any task"
 """Stands for the task's id where a policy is made for none in particular."""
-
-
-def checked_image_size(size_px: object, *, task: str) -> int:
-    """Return the argument `image_size`.
-
-    Raises:
-        TaskArgumentError: the size is impossible.
-    """
-    if isinstance(size_px, int) and MIN_IMAGE_SIZE_PX <= size_px <= MAX_IMAGE_SIZE_PX:
-        return size_px
-    raise TaskArgumentError(
-        f"{task}: {IMAGE_SIZE}={size_px!r:.80}: expected a whole number of pixels, {MIN_IMAGE_SIZE_PX} to "
-        f"{MAX_IMAGE_SIZE_PX}."
-    )
 
 
 StepRange = int | Sequence[int]

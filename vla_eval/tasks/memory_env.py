@@ -33,10 +33,10 @@ from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
 from vla_eval.tasks.arm import fetch, robots  # noqa: F401  importing them registers the arms
 from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS, Arm
 from vla_eval.tasks.arm.robots import ParsedArms, kept_loader
-from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, checked_image_size, step_range
+from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, step_range
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Body, Flags, Indices, Steps, anywhere, place, velocity_of
-from vla_eval.tasks.objects.limits import NotNegative, Positive
+from vla_eval.tasks.objects.limits import ImageSize, NotNegative, Positive
 from vla_eval.tasks.tensors_out import Info, TensorsOut
 
 QPOS_NOISE_RAD = 0.02
@@ -105,7 +105,7 @@ class MemoryTableEnv(TensorsOut):
         *args: Any,
         robot_uids: str = "panda_wristcam",
         control_mode: str | None = None,
-        image_size: int = IMAGE_SIZE_PX,
+        image_size: ImageSize = IMAGE_SIZE_PX,
         cue_steps: StepRange = 5,
         delay_steps: StepRange = 5,
         swap_cue: NotNegative = 0,
@@ -143,7 +143,8 @@ class MemoryTableEnv(TensorsOut):
         if reconfiguration_freq is None:
             on_cpu = kwargs.get("sim_backend", "auto") in CPU_BACKENDS and kwargs.get("num_envs", 1) == 1
             reconfiguration_freq = 1 if on_cpu else 0
-        if checked_image_size(image_size, task=type(self).__name__) != IMAGE_SIZE_PX:
+        limits.check(ImageSize, image_size=image_size)
+        if image_size != IMAGE_SIZE_PX:
             size = {"width": image_size, "height": image_size}
             kwargs["sensor_configs"] = {**kwargs.get("sensor_configs", {}), **size}
         super().__init__(

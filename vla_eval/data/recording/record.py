@@ -35,6 +35,7 @@ from vla_eval.errors import RecordingError
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_file import RunDescription
 from vla_eval.storage.shard import Shard
+from vla_eval.strict.devices import refuse_missing_gpu
 from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.inside import RunnerClass
 from vla_eval.workers.jobs import Answered, JobList
@@ -156,6 +157,7 @@ def record(
         VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk.
     """
     plan = plan_recording(recipe)
+    refuse_missing_gpu(backend.n_gpus, {"render.backend": recipe.render.backend})
     preload = (WORKER_MODULE, *simulator_modules(recipe.simulator))
     if not out.exists():
         backend.prepare(preload)

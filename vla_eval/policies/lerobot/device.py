@@ -5,18 +5,14 @@ from typing import Any  # lerobot is untyped
 
 import torch
 
-from vla_eval.errors import SpecMismatchError
+from vla_eval.strict.devices import check_device, refuse_missing_gpu
 
 
 def choose_device(device: str) -> str:
-    """Return the device that `auto` means here; raise `SpecMismatchError` for a GPU that is not there."""
-    has_cuda = torch.cuda.is_available()
+    """Return the device that `auto` means here; refuse one that is not there."""
     if device == "auto":
-        return "cuda" if has_cuda else "cpu"
-    if device.startswith("cuda") and not has_cuda:
-        raise SpecMismatchError(
-            f"device is '{device}', but torch finds no GPU here. Run `mikasa-vla doctor`, or use device: cpu."
-        )
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    refuse_missing_gpu(torch.cuda.device_count(), {"device": check_device(device)})
     return device
 
 

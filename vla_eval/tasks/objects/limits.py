@@ -10,7 +10,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 
 from vla_eval.control_modes import EE_DELTA_POS, EE_DELTA_POSE
 from vla_eval.errors import TaskArgumentError
-from vla_eval.strict.bounds import MAX_STEPS
+from vla_eval.strict.bounds import MAX_IMAGE_SIZE_PX, MAX_STEPS, MIN_IMAGE_SIZE_PX
 from vla_eval.tasks.objects.item_names import COLOR_NAMES, MIXED_SHAPE_NAMES, N_MIXED_COLORS
 from vla_eval.tasks.objects.layout import GOAL_X_M, START_BANDS_Y_M, START_X_M
 
@@ -56,6 +56,7 @@ GoalRadius = Annotated[
         why=", or the cube can lie in the goal region from the start",
     ),
 ]
+ImageSize = Annotated[int, Limits(MIN_IMAGE_SIZE_PX, MAX_IMAGE_SIZE_PX, why=" pixels")]
 StepCount = Annotated[int, Limits(0, MAX_STEPS)]
 SomeSteps = Annotated[int, Limits(1, MAX_STEPS)]
 # Neighbours may lie 6 cm apart: larger ones would overlap.
