@@ -125,6 +125,12 @@ class TestDataset:
         assert main(["view", str(recorded), "--seed", "1003", "--print"]) == 0
         assert Path(capsys.readouterr().out.strip()).name == "episode_000002.rrd"
 
+    def test_the_folder_that_record_was_given_is_its_one_dataset(
+        self, recorded: Path, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        assert main(["view", str(recorded.parent), "--print"]) == 0
+        assert len(capsys.readouterr().out.splitlines()) == 4
+
     @pytest.mark.parametrize(
         ("arguments", "said"),
         [

@@ -267,6 +267,30 @@ def test_the_folder_of_run_folders_is_recognised(tmp_path: Path) -> None:
         read_run(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("file", "kind"),
+    [
+        ("meta/info.json", "dataset"),
+        ("finetune.json", "training"),
+        ("config.json", "checkpoint"),
+        ("recording.lock", "recording's state"),
+    ],
+)
+def test_a_folder_of_another_kind_is_named_and_never_offered_as_a_run(
+    file: str, kind: str, tmp_path: Path
+) -> None:
+    folder = tmp_path / "out" / "one"
+    (folder / file).parent.mkdir(parents=True)
+    for name in ("run.json", file) if file == "recording.lock" else (file,):
+        (folder / name).write_text("{}")
+    with pytest.raises(RunFolderError, match=f"one: is a {kind}.*, not a run folder"):
+        read_run(folder)
+    with pytest.raises(RunFolderError) as found:
+        read_run(tmp_path)
+    assert "holds some" not in str(found.value)
+    assert (f"Below it are {kind}s: {folder}." in str(found.value)) == (file != "recording.lock")
+
+
 def test_store_and_records_import_nothing_heavy() -> None:
     code = (
         "import sys, vla_eval.storage.run_folder, vla_eval.records\n"

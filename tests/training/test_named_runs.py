@@ -59,7 +59,7 @@ def test_a_dataset_levels_below_is_named_and_is_no_recording_that_resumes(tmp_pa
     with pytest.raises(DatasetError) as refused:
         look_for(asked(Path("act"), str(tmp_path / "data")))
 
-    assert f"Below it are {dataset}. Name one." in str(refused.value)
+    assert f"Below it are datasets: {dataset}." in str(refused.value)
     assert "resumes" not in str(refused.value)
 
 

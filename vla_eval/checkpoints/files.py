@@ -17,6 +17,7 @@ from vla_eval.config.shipped import search_folders
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
 from vla_eval.lock.switch import distrust
 from vla_eval.seeding import SeedRange
+from vla_eval.storage.folders import what_is
 from vla_eval.strict.decoding import decode
 from vla_eval.strict.json_fields import FETCH_AGAIN, get_text
 from vla_eval.strict.json_fields import read_json as read_json  # where most look for it
@@ -100,8 +101,8 @@ def find_checkpoint(path: Path) -> Path:
     hint = command or did_you_mean(str(path), list_checkpoints())
     raise CheckpointError(
         f"{asked!s:.300}: expected a LeRobot checkpoint ({CONFIG_FILE} and {WEIGHTS_FILE}), or a run folder "
-        f"that holds checkpoints/last/{MODEL_FOLDER}; found {found}. Weights in other formats (.bin, .pt) "
-        f"are never loaded: convert them to safetensors.{hint}"
+        f"that holds checkpoints/last/{MODEL_FOLDER}; found {found}.{what_is(path)} Weights in other formats "
+        f"(.bin, .pt) are never loaded: convert them to safetensors.{hint}"
     )
 
 

@@ -15,7 +15,6 @@ DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd â€
 RUN may also be a dataset (OUT/TASK of `mikasa-vla record`, or any LeRobotDataset v3): its episodes are shown.
 Without a choice, the first five are opened. On a machine without a screen, --web serves the viewer to a
 browser, and --print names the files, to be copied to a machine with one (`rerun FILEâ€¦` opens them)."""
-DATASET_FILE = Path("meta") / "info.json"
 RUN_FLAGS = {"--task": "task", "--policy": "policy", "--n-action-steps": "n_action_steps"}
 
 
@@ -35,10 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Find the rerun files and open them."""
+    from vla_eval.data.info_file import one_dataset
+    from vla_eval.storage.folders import kind_of
     from vla_eval.viz.picking import MOST_OPENED
     from vla_eval.workers.children import bound_command
 
-    if (args.run / DATASET_FILE).is_file():
+    if kind_of(args.run) is None and args.run.is_dir():
+        args.run = one_dataset(args.run)
+    if kind_of(args.run) == "dataset":
         _check_screen(args)  # before episodes are decoded and written
         found = _of_dataset(args)
     else:

@@ -8,7 +8,8 @@ from vla_eval.data.facts import KINDS, DatasetFacts, Facts, find_facts, kind_of,
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.manifest import FAILED_FILE, MANIFEST_FILE, MIKASA_FOLDER, RECORDING_FILE, FileDigest
-from vla_eval.errors import DatasetError, some_of
+from vla_eval.errors import DatasetError
+from vla_eval.storage.folders import what_is
 
 # What a dataset consists of; a card, a replay's report and what the Hub's client leaves are not part of it.
 CONTENT = (
@@ -18,8 +19,6 @@ CONTENT = (
     "meta/*.parquet",
     "meta/episodes/**/*.parquet",
 )
-
-DEEPEST = 3  # folders below the named one in which datasets are looked for, for a message
 
 
 def check_complete(root: Path) -> Facts:
@@ -36,7 +35,7 @@ def require_finished(root: Path) -> Facts:
         return facts
     if not (root / MIKASA_FOLDER).is_dir() and not (root / INFO_FILE).is_file():
         raise DatasetError(
-            f"{root}: expected the folder of a dataset, found no {INFO_FILE} in it.{datasets_below(root)}"
+            f"{root}: expected the folder of a dataset, found no {INFO_FILE} in it.{found_or_how(root)}"
         )
     *others, last = (str(kind.file) for kind in KINDS)
     finish = "If another program made it: mikasa-vla dataset check shows how it can be used."
@@ -48,13 +47,10 @@ def require_finished(root: Path) -> Facts:
     )
 
 
-def datasets_below(root: Path) -> str:
-    """Return a sentence for a message: which datasets lie a few folders below, or how to make one."""
-    depths = (f"{'*/' * depth}{INFO_FILE}" for depth in range(1, DEEPEST + 1))
-    below = sorted(path.parent.parent for pattern in depths for path in root.glob(pattern))
-    if not below:
-        return " `mikasa-vla record` makes datasets; a recording that was stopped is resumed by its command."
-    return f" Below it are {some_of(below)}. Name one."
+def found_or_how(root: Path) -> str:
+    """Return a sentence for a message: what there is instead of a dataset, or how to make one."""
+    how = " `mikasa-vla record` makes datasets; a recording that was stopped is resumed by its command."
+    return what_is(root) or how
 
 
 def check_dataset(root: Path) -> DatasetFacts:

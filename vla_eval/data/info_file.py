@@ -148,6 +148,6 @@ def one_dataset(root: Path) -> Path:
     if len(held) > 1:
         raise DatasetError(
             f"{root}: expected one dataset, found {len(held)}: {some_of(path.name for path in held)}. Name "
-            f"one, for example --dataset {held[0]}, or make one of them (`mikasa-vla dataset mix`)."
+            f"one, for example {held[0]}, or make one of them (`mikasa-vla dataset mix`)."
         )
     return held[0] if held else root

@@ -2,9 +2,10 @@
 
 import os
 from collections.abc import Collection
+from itertools import islice
 from pathlib import Path
 
-from vla_eval.errors import RunFolderError, VlaEvalError, did_you_mean
+from vla_eval.errors import RunFolderError, VlaEvalError, did_you_mean, some_of
 from vla_eval.storage.run_file import RUN_FILE
 
 EPISODES_FILE = "episodes.jsonl"
@@ -57,8 +58,39 @@ def _check_subfolder(path: Path) -> None:
         )
 
 
+RUN, RECORDING = "run", "recording's state, from which its command resumes"
+_FILES = {
+    "recording.lock": RECORDING,
+    RUN_FILE: RUN,
+    "finetune.json": "training",
+    "meta/info.json": "dataset",
+    "config.json": "checkpoint",
+}
+_DEEPEST, _MOST = 3, 1000  # levels below a folder, and folders of a level, in which others are looked for
+
+
+def kind_of(path: Path) -> str | None:
+    """Return in words what a folder is; None: nothing that is known here."""
+    return next((kind for file, kind in _FILES.items() if os.path.isfile(path / file)), None)
+
+
+def what_is(path: Path) -> str:
+    """Return a sentence for a message: what a folder is, or what lies below it; empty if that is nothing."""
+    if kind := kind_of(path):
+        return f" It is a {kind}."
+    for depth in range(1, _DEEPEST + 1):
+        places = sorted(islice(path.glob("*/" * depth), _MOST))
+        found = {place: kind for place in places if (kind := kind_of(place)) not in (None, RECORDING)}
+        if found:
+            kinds = " or ".join(f"{kind}s" for kind in dict.fromkeys(found.values()))
+            return f" Below it are {kinds}: {some_of(found)}."
+    return ""
+
+
 def not_a_run_folder(path: Path) -> RunFolderError:
     """Build the error for a folder that is not a run folder, with the ones that may have been meant."""
+    if kind := kind_of(path):
+        return RunFolderError(f"{path}: is a {kind}, not a run folder: `mikasa-vla eval` makes one.")
     inside = _run_folders(path)
     if inside:
         shown = " ".join(str(path / name) for name in inside[:5])
@@ -67,13 +99,13 @@ def not_a_run_folder(path: Path) -> RunFolderError:
     siblings = _run_folders(path.parent)
     known = f" Run folders in {path.parent}: {', '.join(siblings[:10])}." if siblings else ""
     return RunFolderError(
-        f"{path}: is not a run folder: it {what}.{did_you_mean(path.name, siblings)}{known} "
+        f"{path}: is not a run folder: it {what}.{what_is(path)}{did_you_mean(path.name, siblings)}{known} "
         f"`mikasa-vla eval` makes one."
     )
 
 
 def _run_folders(folder: Path) -> list[str]:
     try:
-        return sorted(entry.name for entry in folder.iterdir() if (entry / RUN_FILE).is_file())
+        return sorted(entry.name for entry in folder.iterdir() if kind_of(entry) == RUN)
     except OSError:  # no folder, or one that may not be looked into: there is nothing to suggest
         return []

@@ -20,7 +20,15 @@ from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device
 from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder
 from vla_eval.storage.episodes_file import parse_records, repair_records, shown_key
-from vla_eval.storage.folders import EPISODES_FILE, LOCK_FILE, TIMINGS_FILE, check_folder, not_a_run_folder
+from vla_eval.storage.folders import (
+    EPISODES_FILE,
+    LOCK_FILE,
+    RUN,
+    TIMINGS_FILE,
+    check_folder,
+    kind_of,
+    not_a_run_folder,
+)
 from vla_eval.storage.planned import PlannedEpisodes
 from vla_eval.storage.run_file import (
     DEVICE,
@@ -241,10 +249,9 @@ def read_run(path: Path) -> StoredRun:
     Raises:
         RunFolderError: it is not a run folder, or a file in it is damaged.
     """
-    try:
-        run_file = RunFile.load(path)
-    except (FileNotFoundError, NotADirectoryError) as exc:
-        raise not_a_run_folder(path) from exc
+    if kind_of(path) != RUN:
+        raise not_a_run_folder(path)
+    run_file = RunFile.load(path)
     return StoredRun(
         path=path,
         description=run_file.description,

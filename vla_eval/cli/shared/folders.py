@@ -12,6 +12,7 @@ from vla_eval.checkpoints.files import read_facts as read_training_facts
 from vla_eval.data.facts import find_facts
 from vla_eval.data.info_file import INFO_FILE, read_info
 from vla_eval.errors import RunFolderError, some_of
+from vla_eval.storage.folders import kind_of, what_is
 from vla_eval.storage.run_file import RUN_FILE
 from vla_eval.storage.run_folder import read_run
 from vla_eval.training.run_folder import RUN_FILE as TRAINING_FILE
@@ -21,10 +22,9 @@ type Lines = Iterator[tuple[str, str]]  # label, text
 
 
 class _Kind(NamedTuple):
-    """A kind of folder: a file that shows it, what it holds, and the next commands."""
+    """A kind of folder: its word in `kind_of`, what it holds, and the next commands."""
 
     word: str
-    is_it: Callable[[Path], bool]
     lines: Callable[[Path], Lines]
     next_steps: tuple[str, ...]
 
@@ -32,7 +32,7 @@ class _Kind(NamedTuple):
 def folder_lines(folder: Path) -> Lines:
     """Yield label and text of each line that describes a folder."""
     for kind in KINDS:
-        if kind.is_it(folder):
+        if kind.word == kind_of(folder):
             yield kind.word, str(folder)
             yield from kind.lines(folder)
             for index, step in enumerate(kind.next_steps):
@@ -41,7 +41,7 @@ def folder_lines(folder: Path) -> Lines:
     found = some_of(sorted(os.listdir(folder))) or "nothing"
     raise RunFolderError(
         f"{folder}: expected a run ({RUN_FILE}), a training ({TRAINING_FILE}), a dataset ({INFO_FILE}) or a "
-        f"checkpoint ({CONFIG_FILE} and weights); found {found}."
+        f"checkpoint ({CONFIG_FILE} and weights); found {found}.{what_is(folder)}"
     )
 
 
@@ -88,20 +88,17 @@ EVALUATE = "mikasa-vla eval --task TASK --policy {folder} cue_blind oracle rando
 KINDS = (
     _Kind(
         "run",
-        lambda folder: (folder / RUN_FILE).is_file(),
         _of_run,
         ("mikasa-vla report {folder}", "mikasa-vla report {folder} --html PAGE", "mikasa-vla view {folder}"),
     ),
-    _Kind("training", lambda folder: (folder / TRAINING_FILE).is_file(), _of_training, (EVALUATE,)),
+    _Kind("training", _of_training, (EVALUATE,)),
     _Kind(
         "dataset",
-        lambda folder: (folder / INFO_FILE).is_file(),
         _of_dataset,
         ("mikasa-vla dataset check {folder}", "mikasa-vla finetune --policy RECIPE --dataset {folder}"),
     ),
     _Kind(
         "checkpoint",
-        lambda folder: (folder / CONFIG_FILE).is_file(),
         _of_checkpoint,
         ("mikasa-vla checkpoint verify {folder}", EVALUATE),
     ),

@@ -24,6 +24,7 @@ from vla_eval.data.opening import LocalDataset
 from vla_eval.errors import DatasetError
 from vla_eval.features import ACTION_KEY, DONE_KEY, REWARD_KEY, SUCCESS_KEY, StateKind
 from vla_eval.storage.drafts import whole_folder
+from vla_eval.storage.folders import what_is
 
 NPZ_NAME = "train_data_{}.npz"  # as the authors' recorder calls its files
 NPZ_FIELDS = {"joints": JOINTS_KEY, "reward": REWARD_KEY, "success": SUCCESS_KEY, "done": DONE_KEY}
@@ -43,7 +44,7 @@ def find_source(path: Path) -> Source:
     if not npz:
         raise DatasetError(
             f"{path}: neither a LeRobotDataset (meta/info.json) nor *.npz files. Name the folder of one "
-            f"task; docs/dataset_tools.md lists the layouts that can be read."
+            f"task; docs/dataset_tools.md lists the layouts that can be read.{what_is(path)}"
         )
     return npz_source(path, npz)
 

@@ -8,7 +8,7 @@ from typing import Literal
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import TimeoutConfig
-from vla_eval.data.dataset_folder import datasets_below
+from vla_eval.data.dataset_folder import found_or_how
 from vla_eval.data.facts import DatasetFacts, read_facts
 from vla_eval.data.manifest import (
     MIXTURE_FILE,
@@ -82,7 +82,7 @@ def find_datasets(path: Path) -> tuple[Path, ...]:
     if not below:
         raise DatasetError(
             f"{path}: holds no finished dataset (no {RECORDING_FILE}, here or one folder below). If a "
-            f"recording was stopped, its command resumes it.{datasets_below(path)}"
+            f"recording was stopped, its command resumes it.{found_or_how(path)}"
         )
     return tuple(below)
 
