@@ -5,9 +5,11 @@ from typing import Any  # a policy is whatever the user gives
 from vla_eval.cli.check import DEFAULT_TASK
 from vla_eval.policies.entries import load_policy_entry
 from vla_eval.policies.given import given_entry
+from vla_eval.strict.calls import public
 from vla_eval.testing.check_recipe import check_recipe
 
 
+@public
 def check_policy(policy: Any, *, task: str = DEFAULT_TASK) -> list[str]:
     """Check without a simulator whether a policy keeps its contract; return the requirements that are met.
 

@@ -6,9 +6,11 @@ from typing import Any  # plain data
 from vla_eval.api.configured import configured
 from vla_eval.cli.finetune import finetune_with_progress
 from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.strict.calls import public
 from vla_eval.training.request import FinetuneSummary
 
 
+@public
 def finetune(
     config: FinetuneConfig | str | Path | None = None,
     *,

@@ -21,6 +21,7 @@ from vla_eval.probe.page.sections import retention_plots
 from vla_eval.probe.probe_text import render_probe
 from vla_eval.probe.table import ProbeTable, read_probe
 from vla_eval.results.formats import Format
+from vla_eval.strict.calls import public
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +38,7 @@ class ProbeResult:
     found: ProbeTable
     plots: tuple[Path, ...]
 
+    @public
     def table(self, format: Format = "markdown") -> Text:
         """Return the table, as `mikasa-vla probe` prints it."""
         return Text(render_probe(self.found, format), format)
@@ -52,6 +54,7 @@ class ProbeResult:
         return notebook_html(self.table("html-table"), [drawn])
 
 
+@public
 def run_probe(
     config: EvalConfig | str | Path | None = None,
     *,

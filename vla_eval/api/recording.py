@@ -12,8 +12,10 @@ from vla_eval.data.info_file import one_dataset
 from vla_eval.data.opening import OpenDataset, open_dataset
 from vla_eval.data.recording.record import RecordingSummary
 from vla_eval.errors import DatasetError
+from vla_eval.strict.calls import public
 
 
+@public
 def record(
     recipe: DatasetRecipe | str | Path | None = None,
     *,
@@ -65,6 +67,7 @@ def record(
     return summary
 
 
+@public
 def load_dataset(folder: str | Path) -> OpenDataset:
     """Open a dataset of this project after comparing all of its files with their digests.
 

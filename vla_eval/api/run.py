@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self  # plain data
 
 from markupsafe import Markup
 
-from vla_eval.errors import check_names, unknown_name
+from vla_eval.errors import RunFolderError, check_names
 from vla_eval.page.build import write_page
 from vla_eval.page.material import gather
 from vla_eval.page.rates import success_plots
@@ -19,6 +19,7 @@ from vla_eval.results.sweep import DEFAULT_DIFFERENCE, compare_runs
 from vla_eval.results.sweep_format import render_sweep
 from vla_eval.results.verdict import verdicts
 from vla_eval.storage.run_folder import StoredRun, read_run
+from vla_eval.strict.calls import public
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -67,6 +68,7 @@ class Run:
         """Every episode: of each the success or failure if there is one, else the last error."""
         return tuple(record for run in self.stored for record in run.records)
 
+    @public
     def table(
         self,
         format: Format = "markdown",
@@ -98,6 +100,7 @@ class Run:
             format,
         )
 
+    @public
     def to_pandas(self, kind: Literal["table", "episodes"] = "table") -> "pd.DataFrame":
         """Return a data frame.
 
@@ -111,12 +114,12 @@ class Run:
         """
         import pandas as pd
 
-        if kind not in FRAMES:
-            raise unknown_name("kind of data frame", kind, FRAMES, where="to_pandas")
+        check_names("kind of data frame", [kind], FRAMES, where="to_pandas")
         if kind == "table":
             return pd.DataFrame([row.to_dict() for row in build_table(self.stored).rows])
         return pd.DataFrame([_episode(run, record) for run in self.stored for record in run.records])
 
+    @public
     def compare(
         self,
         *,
@@ -135,6 +138,7 @@ class Run:
         sweep = compare_runs(self.stored, by=by, reference=named, difference=difference)
         return Text(render_sweep(sweep, format), format)
 
+    @public
     def page(self, folder: str | Path | None = None, *, baseline: str | None = None) -> Path:
         """Write the report page and return its file; by default in a folder beside the run's.
 
@@ -174,6 +178,7 @@ def in_colors(drawn: Sequence[Markup]) -> Markup:
     return Markup('<div style="{}">{}</div>').format(style, Markup("\n").join(drawn))
 
 
+@public
 def load_run(*folders: str | Path) -> Run:
     """Read run folders without touching them; a run may be writing to one.
 
@@ -181,7 +186,7 @@ def load_run(*folders: str | Path) -> Run:
         RunFolderError: one is not a run folder, or a file in it is damaged.
     """
     if not folders:
-        raise TypeError("load_run() needs at least one run folder")
+        raise RunFolderError("load_run: expected at least one run folder, found none.")
     return Run([read_run(Path(folder)) for folder in folders])
 
 

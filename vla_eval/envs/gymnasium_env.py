@@ -19,6 +19,7 @@ from vla_eval.envs.factory import describe_env
 from vla_eval.envs.factory import make_env as make_sim_env
 from vla_eval.errors import InvalidActionError, TaskArgumentError, check_names, unknown_name
 from vla_eval.features import FPS, IMAGE_SIZE_PX
+from vla_eval.strict.calls import public
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import CAMERA_NAMES, IMAGE_SIZE
 from vla_eval.tasks.spec import TaskSpec
@@ -163,6 +164,7 @@ class TaskEnv(gym.Env[dict[str, Any], NDArray[Any]]):
         return numbers
 
 
+@public
 def make_env(
     task: str,
     *,
