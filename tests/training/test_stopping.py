@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from safetensors import SafetensorError
 
 from tests.training import tiny_trainings
 from tests.training.test_held_out import metrics, same_weights
 from tests.training.tiny_trainings import SHORT, TINY_ACT, act
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.cli.main import main
+from vla_eval.errors import StorageFullError
 from vla_eval.training import loop
 from vla_eval.training.finetune import finetune
 
@@ -47,6 +49,23 @@ def test_a_training_that_was_stopped_ends_with_the_very_weights_of_one_that_was_
     assert same_weights(straight, stopped)
     assert metrics(stopped) == metrics(straight)
     assert checkpoints(stopped) == ["000002", "000004", "last"]  # the extra one has served its purpose
+
+
+def test_a_full_disk_is_named_and_the_same_command_resumes(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the first checkpoint the configuration fits, the weights do not."""
+    straight, run = tmp_path / "straight", tmp_path / "run"
+
+    def save(*_: Any, **__: Any) -> None:
+        raise SafetensorError("Error while serializing: I/O error: No space left on device (os error 28)")
+
+    with monkeypatch.context() as full:
+        full.setattr("safetensors.torch.save_file", save)
+        with pytest.raises(StorageFullError, match=r"run: could not be written .*run the same command again"):
+            finetune(act(recorded, run))
+    assert finetune(act(recorded, straight)).is_finished and finetune(act(recorded, run)).is_finished
+    assert same_weights(straight, run)
 
 
 def test_nothing_is_written_twice_and_nothing_before_the_first_step(recorded: Path, tmp_path: Path) -> None:

@@ -1,9 +1,7 @@
 """Make a LeRobot checkpoint of a published one, by its family's converter; a whole folder or none."""
 
-import contextlib
 import json
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any  # a family's options
 
@@ -27,6 +25,7 @@ from vla_eval.models.family import Base, imported
 from vla_eval.models.shared.options import typed
 from vla_eval.models.shared.original import Original
 from vla_eval.models.weights.exact import put_weights
+from vla_eval.storage.drafts import whole_folder
 
 TOKENIZER_FILES = ("tokenizer*", "special_tokens_map.json", "added_tokens.json")
 
@@ -37,7 +36,8 @@ def convert(kind: str, source: Path, out: Path, options: Any) -> Path:
     original: Original = imported(FAMILIES[kind].converter)(source, options)
     policy = make_unfilled_policy(original.config)
     put_weights(policy, original.weights(policy), where=str(source), cast=original.casts)
-    with folder_when_whole(out) as partial:
+    with whole_folder(out, error=CheckpointError) as partial:
+        partial.mkdir(parents=True)
         _save(original, policy, source, partial, out)
     return out
 
@@ -87,17 +87,6 @@ def check_free(out: Path) -> None:
         raise CheckpointError(f"{out} exists already. Name another folder.")
 
 
-@contextlib.contextmanager
-def folder_when_whole(out: Path) -> Iterator[Path]:
-    """Give a folder to write into, which gets its name, not taken so far, once everything is in it."""
-    check_free(out)
-    partial = out.with_name(f"{out.name}.partial")  # which the lock lets be written, too
-    shutil.rmtree(partial, ignore_errors=True)
-    partial.mkdir(parents=True)
-    yield partial
-    partial.rename(out)
-
-
 def _copy_tokenizer(source: Path, folder: Path) -> Path:
     files = [file for pattern in TOKENIZER_FILES for file in sorted(source.glob(pattern)) if file.is_file()]
     if not files:
@@ -122,7 +111,8 @@ def merge_adapter(path: Path, out: Path, *, base_checkpoint: str | None = None) 
     merged = load_weights(folder, config, options).merge_and_unload()
     described = {**read_json(folder / CONFIG_FILE), "use_peft": False, "pretrained_path": None}
     weights = {name: tensor.cpu().contiguous() for name, tensor in merged.state_dict().items()}
-    with folder_when_whole(out) as partial:
+    with whole_folder(out, error=CheckpointError) as partial:
+        partial.mkdir(parents=True)
         shutil.copytree(folder, partial, ignore=shutil.ignore_patterns(*NOT_COPIED), dirs_exist_ok=True)
         (partial / CONFIG_FILE).write_text(f"{json.dumps(described, indent=4)}\n", encoding="utf-8")
         save_file(weights, partial / WEIGHTS_FILE)

@@ -24,6 +24,7 @@ from vla_eval.config.files import apply_overrides
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.model_table import is_model_table
+from vla_eval.storage.folders import check_writable
 from vla_eval.strict.decoding import set_field
 
 if TYPE_CHECKING:
@@ -130,13 +131,14 @@ def finetune_with_progress(
     config: FinetuneConfig, *, command: str
 ) -> "tuple[FinetuneSummary, StopRequest | None]":
     """Fine-tune, or resume it, with lines on standard error; the request if a signal has stopped it."""
-    from vla_eval.training.request import finished_run, look_for
+    from vla_eval.training.request import finished_run, look_for, run_folder_of
 
     look_for(config)
     finished = finished_run(config)
     if finished is not None:
         print(finished, file=sys.stderr)
         return finished, None
+    check_writable(run_folder_of(config))
     # Here and not above: what is finished need not wait for torch.
     from tqdm import tqdm
 

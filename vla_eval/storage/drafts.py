@@ -10,7 +10,7 @@ from pathlib import Path
 
 from vla_eval.errors import VlaEvalError
 from vla_eval.lock.switch import let_write
-from vla_eval.storage.durable import sync_folder, sync_tree
+from vla_eval.storage.durable import on_disk, sync_folder, sync_tree
 
 DRAFT_SUFFIX = ".draft"
 NO_LINKS = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS})
@@ -26,8 +26,9 @@ def whole_folder(out: Path, *, error: type[VlaEvalError]) -> Iterator[Path]:
     draft = draft_path(out)
     draft.parent.mkdir(parents=True, exist_ok=True)
     try:
-        yield draft
-        publish(draft, out)
+        with on_disk(out):
+            yield draft
+            publish(draft, out)
     except BaseException:
         remove_drafts(out)
         raise

@@ -9,6 +9,7 @@ import errno
 import fcntl
 import logging
 import os
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
@@ -16,6 +17,8 @@ from vla_eval.errors import FolderInUseError, RunFolderError, StorageFullError
 from vla_eval.strict.json_text import Source, read_file
 
 logger = logging.getLogger(__name__)
+
+DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 def sync_folder(folder: Path) -> None:
@@ -174,9 +177,23 @@ class FolderLock:
             self._fd = -1
 
 
+@contextlib.contextmanager
+def on_disk(path: Path) -> Iterator[None]:
+    """Raise `StorageFullError` if what is written below a path meets a full or a broken disk."""
+    try:
+        yield
+    except Exception as exc:  # that of safetensors only names the number
+        named = re.search(r"\(os error (\d+)\)", str(exc))
+        number = int(named[1]) if named else getattr(exc, "errno", None)
+        if number not in DISK_TROUBLE:
+            raise
+        raise storage_full(path, OSError(number, os.strerror(number))) from exc
+
+
 def storage_full(path: Path, cause: OSError) -> StorageFullError:
     """Build the error for a file that could not be written, or only in part."""
+    is_closed = cause.errno in (errno.EACCES, errno.EPERM, errno.EROFS)
     return StorageFullError(
         f"{path}: could not be written ({cause.strerror or cause}). Nothing that was reported as finished is "
-        f"lost. Free some space and run the same command again."
+        f"lost. {'Make it writable' if is_closed else 'Free some space'} and run the same command again."
     )

@@ -19,6 +19,7 @@ UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 
 def check_folder(path: Path) -> None:
     """Refuse a folder that a run cannot go into."""
+    check_writable(path)
     if path.exists() and not path.is_dir():
         raise RunFolderError(f"{path}: expected a folder, found a file. Use another --out.")
     for name in SUBFOLDERS:
@@ -32,6 +33,17 @@ def check_folder(path: Path) -> None:
             f"Restore {RUN_FILE} or use another --out."
         )
     raise other_files(path, names - UNSTARTED, missing=RUN_FILE, error=RunFolderError)
+
+
+def check_writable(path: Path) -> None:
+    """Raise `RunFolderError` if this user may not make or change the folder."""
+    whole = path.absolute()
+    there = next(one for one in (whole, *whole.parents) if os.path.exists(one))
+    if there.is_dir() and not os.access(there, os.W_OK | os.X_OK):
+        raise RunFolderError(
+            f"{path}: cannot be written into: this user has no permission for {there}. Change that, or name "
+            "another folder."
+        )
 
 
 def other_files(
@@ -51,11 +63,7 @@ def _check_subfolder(path: Path) -> None:
         raise RunFolderError(
             f"{path}: expected a folder, found something else. Move it away, or use another --out."
         )
-    if path.is_dir() and not os.access(path, os.W_OK | os.X_OK):
-        raise RunFolderError(
-            f"{path}: expected a folder that can be written into, found one without the permission. Change "
-            f"that, or use another --out."
-        )
+    check_writable(path)
 
 
 RUN, RECORDING = "run", "recording's state, from which its command resumes"

@@ -9,7 +9,7 @@ from vla_eval.errors import MergeError
 from vla_eval.records import EpisodeKey, EpisodeRecord
 from vla_eval.storage.capture_files import rrd_file, thumbnail_file, video_file
 from vla_eval.storage.drafts import link_file, whole_folder
-from vla_eval.storage.durable import replace_file, storage_full
+from vla_eval.storage.durable import replace_file
 from vla_eval.storage.episodes_file import shown_key
 from vla_eval.storage.folders import EPISODES_FILE, TIMINGS_FILE
 from vla_eval.storage.run_file import RunFile
@@ -55,18 +55,15 @@ def write_merged(merged: MergedRun, out: Path) -> None:
     """Write the run folder, captures linked or copied; after an error nothing is left."""
     timings = {key: one for run in merged.runs for key, one in read_timings(run.path).items()}
     kept = [timings[record.key].to_json() for record in merged.records if record.key in timings]
-    try:
-        with whole_folder(out, error=MergeError) as draft:
-            draft.mkdir()
-            replace_file(draft / TIMINGS_FILE, "".join(f"{line}\n" for line in kept))
-            replace_file(draft / EPISODES_FILE, "".join(f"{one.to_json()}\n" for one in merged.records))
-            merged.run_file.save(draft)
-            for run in merged.runs:
-                for place, record in itertools.product(CAPTURES, run.records):
-                    if place(run.path, record).is_file():
-                        link_file(place(run.path, record), place(draft, record))
-    except OSError as exc:
-        raise storage_full(out, exc) from exc
+    with whole_folder(out, error=MergeError) as draft:
+        draft.mkdir()
+        replace_file(draft / TIMINGS_FILE, "".join(f"{line}\n" for line in kept))
+        replace_file(draft / EPISODES_FILE, "".join(f"{one.to_json()}\n" for one in merged.records))
+        merged.run_file.save(draft)
+        for run in merged.runs:
+            for place, record in itertools.product(CAPTURES, run.records):
+                if place(run.path, record).is_file():
+                    link_file(place(run.path, record), place(draft, record))
 
 
 def _missing_episodes(part: ShardPart, there: set[EpisodeKey]) -> Iterator[str]:

@@ -1,7 +1,6 @@
 """Start to write into a folder: make it, lock it, and leave nothing behind if the start fails."""
 
 import contextlib
-import errno
 import logging
 import os
 import shutil
@@ -11,12 +10,11 @@ from pathlib import Path
 
 from vla_eval.errors import RunFolderError
 from vla_eval.lock.switch import let_write
-from vla_eval.storage.durable import FolderLock, storage_full
+from vla_eval.storage.durable import DISK_TROUBLE, FolderLock, storage_full
 
 logger = logging.getLogger(__name__)
 
 LOGS_FOLDER = "logs"
-DISK_TROUBLE = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
 
 
 class FolderStart:

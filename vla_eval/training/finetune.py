@@ -17,6 +17,7 @@ from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.data.exact_statistics import about_still_dimensions
 from vla_eval.errors import VlaEvalError
 from vla_eval.models.shared.sentence_reading import SentenceReading, SentenceWatch
+from vla_eval.storage.durable import on_disk
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.starting import starting
 from vla_eval.training.cost.estimate import RateWatch, estimate
@@ -233,13 +234,14 @@ def _opened(job: TrainingJob, config: FinetuneConfig, command: str) -> Iterator[
     with starting(job.out, own=OWN_FILES, lock_file=LOCK_FILE, purpose=purpose) as started:
         resume_from = _open(job, config, command)
     failed = False
-    try:
-        yield resume_from
-    except VlaEvalError:
-        failed = True
-        raise
-    finally:
-        started.leave(failed=failed)
+    with on_disk(job.out):  # outermost: a run that was stopped by a full disk stays
+        try:
+            yield resume_from
+        except VlaEvalError:
+            failed = True
+            raise
+        finally:
+            started.leave(failed=failed)
 
 
 # glibc's malloc.h

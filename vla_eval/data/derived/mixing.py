@@ -20,7 +20,6 @@ from vla_eval.data.opening import OpenDataset, join_datasets, open_dataset
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.storage.drafts import whole_folder
-from vla_eval.storage.durable import storage_full
 
 
 def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
@@ -38,21 +37,18 @@ def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
         _refuse_difference(opened[0], other)
     sources = tuple(_source(one) for one in opened)
     _refuse_repetition(sources)
-    try:
-        with whole_folder(out, error=DatasetError) as draft:
-            _aggregate([one.root for one in opened], draft)
-            write_statistics(draft, [one.meta for one in opened])
-            facts = MixtureFacts(
-                complete=True,
-                state=opened[0].facts.state,
-                control_mode=opened[0].facts.control_mode,
-                sources=sources,
-                files=digest_files(draft),
-                vla_eval_version=__version__,
-            )
-            write_entry(draft / MIXTURE_FILE, facts)
-    except OSError as exc:
-        raise storage_full(out, exc) from exc
+    with whole_folder(out, error=DatasetError) as draft:
+        _aggregate([one.root for one in opened], draft)
+        write_statistics(draft, [one.meta for one in opened])
+        facts = MixtureFacts(
+            complete=True,
+            state=opened[0].facts.state,
+            control_mode=opened[0].facts.control_mode,
+            sources=sources,
+            files=digest_files(draft),
+            vla_eval_version=__version__,
+        )
+        write_entry(draft / MIXTURE_FILE, facts)
     return facts
 
 

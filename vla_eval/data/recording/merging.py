@@ -21,7 +21,7 @@ from vla_eval.data.recording.seed_queue import SeedQueue, Selection
 from vla_eval.data.recording.worker import join_dataset
 from vla_eval.errors import MergeError
 from vla_eval.storage.drafts import link_tree, whole_folder
-from vla_eval.storage.durable import replace_file, storage_full
+from vla_eval.storage.durable import replace_file
 from vla_eval.storage.run_file import RunFile, find_changes, listed
 from vla_eval.storage.shard_parts import ShardPart, as_part, merge_descriptions, missing_shards
 from vla_eval.strict.decoding import decode
@@ -66,20 +66,17 @@ def merge_recordings(folders: Sequence[Path], *, allow_environment_change: bool 
 
 def write_recording(merged: MergedRecording, out: Path) -> tuple[DatasetFacts, ...]:
     """Write the recording, which `record` resumes if anything is missing; after an error nothing is left."""
-    try:
-        with whole_folder(out, error=MergeError) as draft:
-            for task in merged.tasks:
-                attempts = draft / STATE_FOLDER / task.plan.task / ATTEMPTS_FILE
-                attempts.parent.mkdir(parents=True)
-                if task.attempts.is_file():  # else the part had not begun with this task
-                    replace_file(attempts, task.attempts.read_text(encoding="utf-8"))
-                for index, shard in task.shards.items():
-                    link_tree(shard, shard_path(draft, task.plan.task, index))
-            merged.run_file.save(draft / STATE_FOLDER)
-            whole = () if merged.missing else merged.tasks
-            return tuple(_join(task, merged.run_file, draft) for task in whole)
-    except OSError as exc:
-        raise storage_full(out, exc) from exc
+    with whole_folder(out, error=MergeError) as draft:
+        for task in merged.tasks:
+            attempts = draft / STATE_FOLDER / task.plan.task / ATTEMPTS_FILE
+            attempts.parent.mkdir(parents=True)
+            if task.attempts.is_file():  # else the part had not begun with this task
+                replace_file(attempts, task.attempts.read_text(encoding="utf-8"))
+            for index, shard in task.shards.items():
+                link_tree(shard, shard_path(draft, task.plan.task, index))
+        merged.run_file.save(draft / STATE_FOLDER)
+        whole = () if merged.missing else merged.tasks
+        return tuple(_join(task, merged.run_file, draft) for task in whole)
 
 
 def _plan(run_file: RunFile, where: Path) -> tuple[TaskPlan, ...]:

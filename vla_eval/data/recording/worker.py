@@ -41,8 +41,7 @@ from vla_eval.errors import VlaEvalError
 from vla_eval.evaluation.worker import make_policy
 from vla_eval.features import CAMERA_KEYS, frame_values
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
-from vla_eval.storage.durable import storage_full
-from vla_eval.storage.starting import DISK_TROUBLE
+from vla_eval.storage.durable import DISK_TROUBLE, storage_full
 from vla_eval.workers.inside import Heartbeat
 from vla_eval.workers.messages import DeviceFound
 

@@ -11,6 +11,7 @@ from vla_eval.config.evaluation import TimeoutConfig
 from vla_eval.data.dataset_folder import found_or_how
 from vla_eval.data.facts import DatasetFacts, read_facts
 from vla_eval.data.manifest import (
+    MIKASA_FOLDER,
     MIXTURE_FILE,
     RECORDING_FILE,
     RecordedEpisode,
@@ -23,6 +24,7 @@ from vla_eval.data.recording.record import RecordingObserver
 from vla_eval.data.replaying.episode_check import STATE_TOLERANCE
 from vla_eval.errors import DatasetError, RecipeError, RecordingError
 from vla_eval.features import CAMERA_KEYS
+from vla_eval.storage.folders import check_writable
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
@@ -110,6 +112,8 @@ def replay(
             simulator cannot be started.
     """
     facts, manifest = read_facts(dataset), read_manifest(dataset)
+    if episodes is None:
+        check_writable(dataset / MIKASA_FOLDER)
     environment = collect_environment()
     same_machine = all(facts.environment.get(name) == environment.get(name) for name in MACHINE_FACTS)
     jobs = _jobs(dataset, facts, _chosen(manifest, episodes, dataset), pixels, same_machine)
