@@ -17,7 +17,7 @@ LIKE: dict[Any, Any] = {Path: os.PathLike, int: Integral, float: Real}  # Any: t
 def public[**P, R](function: Callable[P, R]) -> Callable[P, R]:
     """Compare the arguments of each call with the signature; `RecipeError` instead of Python's `TypeError`.
 
-    What stands in lists is checked by whoever reads it.
+    The elements of lists are checked where they are read.
     """
     signature, name = inspect.signature(function), function.__qualname__
 
