@@ -75,6 +75,11 @@ def _module(name: str) -> _Module:
     if found is None or found.origin is None or not found.origin.endswith(".py"):
         return _Module([], {})
     tree = ast.parse(Path(found.origin).read_text(encoding="utf-8"))
+    for node in ast.walk(tree):  # functions are not asked for, and what is kept slows each search for garbage
+        if isinstance(node, ast.Module | ast.ClassDef):
+            node.body = [
+                part for part in node.body if not isinstance(part, ast.FunctionDef) or part.name == "__init__"
+            ]
     package = name if found.submodule_search_locations else name.rpartition(".")[0]
     imported = {
         alias.asname or alias.name: (
