@@ -43,6 +43,7 @@ QPOS_NOISE_RAD = 0.02
 FLOOR_Z_M = -0.9196429  # the height of ManiSkill's table
 PARK_X_M = 150.0  # every camera's far plane is at 100 m
 PARK_SPACING_M = 0.3
+_look_at = functools.cache(sapien_utils.look_at)  # each reset asks for the same
 CPU_BACKENDS = ("auto", "cpu", "physx_cpu")  # "auto" is the CPU for a single environment
 
 
@@ -164,12 +165,12 @@ class MemoryTableEnv(TensorsOut):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = sapien_utils.look_at(eye=[0.3, 0, 0.6], target=[-0.1, 0, 0.1])
+        pose = _look_at((0.3, 0, 0.6), (-0.1, 0, 0.1))
         return [CameraConfig("base_camera", pose, IMAGE_SIZE_PX, IMAGE_SIZE_PX, CAMERA_FOV_RAD, 0.01, 100)]
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
-        pose = sapien_utils.look_at(list(self.HUMAN_CAMERA_EYE), list(self.HUMAN_CAMERA_TARGET))
+        pose = _look_at(self.HUMAN_CAMERA_EYE, self.HUMAN_CAMERA_TARGET)
         return CameraConfig("render_camera", pose, 512, 512, 1.0, 0.01, 100)
 
     def _reconfigure(self, options: dict[str, Any]) -> None:

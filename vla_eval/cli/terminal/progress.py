@@ -1,5 +1,6 @@
 """Progress of a run on standard error: a bar on a terminal, a line from time to time in a log file."""
 
+import importlib
 import os
 import signal
 import sys
@@ -189,6 +190,8 @@ class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
         self._n_done, self._n_total = n_finished, n_episodes
         self._bar.begin(n_done=n_finished, n_total=n_episodes)
         self._bar.doing("starting processes, loading simulator and policies")
+        # The table at the end needs it, and here is nothing to do until a worker has started.
+        threading.Thread(target=importlib.import_module, args=("scipy.stats",)).start()
 
     def on_device(self, device: Mapping[str, str]) -> None:
         """Say that the first simulator is there, and what renders its images."""
