@@ -177,6 +177,8 @@ def _levels(name: str, closest: str, known: Iterable[str]) -> list[str]:
     words = _WORD.findall(closest)
     for index, word in enumerate(words):
         before, after = "".join(words[:index]), "".join(words[index + 1 :])
+        if not re.search(r"\w", before + after):  # any name at all would differ in this word alone
+            continue
         family = f"{re.escape(before)}(%s){re.escape(after)}"
         found = re.fullmatch(family % "[a-z]*|[0-9x]*", name, re.IGNORECASE)
         if found and (word[0].isdigit() or not difflib.get_close_matches(found[1], [word])):

@@ -59,6 +59,36 @@ SLIPS = {
 }
 
 
+# What lerobot-eval, lerobot-train and lerobot-record call it, and other programs.
+SLIPS |= {
+    f"{EVAL} --policy.path=ck": "Did you mean '--policy'?",
+    f"{EVAL} --env.type=mikasa": "Did you mean '--task'?",
+    f"{EVAL} --env.task=x": "Did you mean '--task'?",
+    f"{EVAL} --eval.n_episodes=5": "Did you mean '--episodes'?",
+    f"{EVAL} --eval.batch_size=5": "Did you mean '--workers'?",
+    f"{EVAL} --batch_size 4": "Did you mean '--workers'?",
+    f"{EVAL} --output_dir out": "Did you mean '--out'?",
+    f"{EVAL} --policy.n_action_steps=4": "Did you mean '--n-action-steps'?",
+    f"{EVAL} --policy.device=cuda": "args: {device: cuda}",
+    f"{EVAL} --ckpt x.pt": "Did you mean '--policy'?",
+    f"{EVAL} --max-steps 50": "--set env.horizon_steps=90",
+    f"{EVAL} --Episodes 5": "Did you mean '--episodes'?",
+    "eval --task RememberColor3-v0 --policy lerobot/smolvla_base": "hub:lerobot/smolvla_base@REVISION",
+    "finetune --policy.type=act --dataset d": "Did you mean '--policy'?",
+    "finetune --policy act --dataset.repo_id=d": "Did you mean '--dataset'?",
+    "finetune --policy act --dataset.root=d": "Did you mean '--dataset'?",
+    "finetune --policy act --dataset d --batch_size=8": "Did you mean '--batch-size'?",
+    "finetune --policy act --dataset d --save_freq 100": "--set save_every_steps=",
+    "finetune --policy act --dataset d --wandb.enable=true": "--set wandb_project=NAME",
+    "finetune --policy act --dataset d --learning-rate 1": "Learning rates are fields of the recipe.",
+    "finetune --policy act --dataset d --epochs 3": "Did you mean '--steps'?",
+    "record --task RememberColor3-v0 --dataset.num_episodes=5": "Did you mean '--episodes'?",
+    "report runs/x --latex": "Did you mean '--format'?",
+    "train --policy act": "Did you mean 'finetune'?",
+    "help": "Did you mean '--help'?",
+    "version": "Did you mean '--version'?",
+    "list envs": "Did you mean 'tasks'?",
+}
 SLIPS |= {  # a device that does not exist, wherever one is named
     f"{line} {device}": f"expected auto, cpu, {words}"
     for device in ("gpu", "cuda:x", "GPU")
@@ -128,6 +158,30 @@ def test_a_flag_with_several_values_is_given_once(
     with pytest.raises(SystemExit):
         build_parser((once[0],)).parse_args([*once, flag, value])
     assert f"{flag}: is given twice. Name all after one: {flag} A B." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(f"{EVAL} {flag}" for flag in ("--yes", "--verbose", "--rename_map={}", "--pretrained=x", "--xyz")),
+        *("record --policy oracle", "record --fps 30", "doctor --fix", "check --policy oracle"),
+        *("replay d --dataset d", "compare runs/a --metric success", "view --run runs/a"),
+    ],
+)
+def test_no_flag_is_suggested_that_has_only_its_dashes_in_common(
+    line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    try:
+        assert main(line.split()) == 1
+    except SystemExit as exc:  # argparse's
+        assert exc.code == 1
+    assert "Did you mean" not in capsys.readouterr().err
+
+
+def test_a_word_is_not_taken_for_the_level_of_a_name_that_it_is_all_of() -> None:
+    assert did_you_mean("help", ["eval", "report", "merge", "init"]) in ("", " Did you mean 'eval'?")
+    found = did_you_mean("RememberColor4-v0", ["RememberColor3-v0", "RememberColor5-v0"])
+    assert found == " Did you mean 'RememberColor3-v0' or 'RememberColor5-v0'?"
 
 
 def test_an_empty_variable_is_called_empty(capsys: pytest.CaptureFixture[str]) -> None:

@@ -13,7 +13,7 @@ from typing import NoReturn, Protocol, cast
 from vla_eval import __version__
 from vla_eval.cli.shared.slips import about_choice, about_empty, about_flag
 from vla_eval.cli.terminal.streams import standard_streams
-from vla_eval.errors import MAX_SHOWN, VlaEvalError, did_you_mean
+from vla_eval.errors import MAX_SHOWN, VlaEvalError
 from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
 from vla_eval.workers.children import leave_working_directory
 
@@ -104,7 +104,7 @@ def _run(arguments: list[str]) -> int:
         print(FIRST_STEPS)
         return 0
     if not first.startswith("-") and first not in VERBS:
-        suggestion = did_you_mean(first, VERBS) or f" Known: {', '.join(VERBS)}."
+        suggestion = about_choice(first, (*VERBS, "--help", "--version")) or f" Known: {', '.join(VERBS)}."
         return _fail(f"there is no verb '{first}'.{suggestion} See `{PROGRAM} --help`.")
     parser = build_parser((first,) if first in VERBS else VERBS)
     try:

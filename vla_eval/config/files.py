@@ -9,6 +9,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import types
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -85,9 +86,11 @@ def find_recipe(folder: Folder, name: str) -> Path:
 
 def no_such_path(name: str, command: str) -> UnknownNameError:
     """Build the error for a path to nothing, with the command that lists names."""
+    is_id = command.endswith("policies") and re.fullmatch(r"[\w.-]+/[\w.-]+", name)
+    on_hub = f" If it is on the Hub: hub:{name}@REVISION." if is_id else ""
     return UnknownNameError(
         f"{name:.{MAX_SHOWN}}: there is no such file or folder in {Path.cwd()}. Expected the path of one, or "
-        f"a name of `{command}`."
+        f"a name of `{command}`.{on_hub}"
     )
 
 

@@ -1,6 +1,8 @@
 """Suggestions for flags and words that are often typed for others. Knows nothing of what verbs do."""
 
 import argparse
+import difflib
+import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 
 from vla_eval.errors import NOT_SET, did_you_mean
@@ -10,6 +12,15 @@ MEANT: Mapping[str, Sequence[str]] = {
     "--seeds": ("--seed-start", "--seed", "--run-seed"),
     "--seed-start": ("--seeds", "--seed", "--run-seed"),
     "--run-seed": ("--seed-start", "--seed"),
+    "--num-envs": ("--workers",),
+    "--type": (),
+    "--path": ("--base-checkpoint", "--policy"),
+    "--repo-id": ("--dataset", "--policy"),
+    "--epochs": ("--steps",),
+    "--max-steps": ("--steps", "--set"),
+    "--save-video": ("--capture-video",),
+    "--instruction": ("--set",),
+    "--job-name": ("--out",),
     "--first-seed": ("--seed-start", "--seed"),
     "--n-episodes": ("--episodes", "--episode"),
     "--num-episodes": ("--episodes", "--episode"),
@@ -19,7 +30,8 @@ MEANT: Mapping[str, Sequence[str]] = {
     "--env-id": ("--task",),
     "--policies": ("--policy",),
     "--model": ("--policy",),
-    "--checkpoint": ("--base-checkpoint", "--policy"),
+    **dict.fromkeys(("--checkpoint", "--ckpt", "--weights"), ("--base-checkpoint", "--policy")),
+    **dict.fromkeys(("--csv", "--latex", "--json", "--markdown"), ("--format",)),
     "--policy-path": ("--policy",),
     "--num-workers": ("--workers",),
     "--jobs": ("--workers",),
@@ -37,7 +49,8 @@ MEANT: Mapping[str, Sequence[str]] = {
     "--videos": ("--capture-video",),
     "--rerun": ("--capture-rrd",),
     "--batch": ("--batch-size", "--max-batch"),
-    "--lr": ("--set",),
+    "--batch-size": ("--max-batch", "--workers"),
+    **dict.fromkeys(("--lr", "--learning-rate", "--save-freq", "--log-freq", "--wandb"), ("--set",)),
     "--override": ("--set",),
     "--config": ("--set",),
     "--resume": (),
@@ -56,6 +69,12 @@ TOLD: Mapping[str, str] = {
     "n_action_steps (or policy).",
     "--config": "The configuration comes without a flag: mikasa-vla eval configs/mine.yaml.",
     "--lr": "Learning rates are fields of the recipe.",
+    "--learning-rate": "Learning rates are fields of the recipe.",
+    "--save-freq": "It is a field of the recipe: --set save_every_steps=1000.",
+    "--log-freq": "It is a field of the recipe: --set log_every_steps=100.",
+    "--wandb": "It is a field of the recipe: --set wandb_project=NAME.",
+    "--max-steps": "The length of an episode: --set env.horizon_steps=90.",
+    "--instruction": "Sentences are in a file of prompts: --set prompt_set=FILE.",
 }
 """Flag -> what helps where no verb's flag does, or beside it."""
 WORDS: Mapping[str, str] = {
@@ -65,17 +84,29 @@ WORDS: Mapping[str, str] = {
     "k": "n_action_steps",
     "n-action-steps": "n_action_steps",
     "policies": "policy",
+    **dict.fromkeys(("envs", "environments"), "tasks"),
+    **dict.fromkeys(("models", "checkpoints"), "policies"),
+    **{"train": "finetune", "test": "eval", "info": "show", "help": "--help", "version": "--version"},
 }
 """Word, in small letters -> choice that is meant."""
+CLOSE = 0.65  # of a flag's name, without the dashes that all have
 
 
 def about_flag(flag: str, known: Collection[str]) -> str:
     """Return what to say of a flag that a verb has not."""
-    meant = next((one for one in MEANT.get(flag, ()) if one in known), None)
-    told = f" {TOLD[flag]}" if flag in TOLD and (meant is None or meant == "--set") else ""
-    if meant is not None:
-        return f" Did you mean '{meant}'?{told}"
-    return told or did_you_mean(flag, known)
+    # `--eval.n_episodes` of other programs: as a whole, its last name, its first.
+    whole = re.sub(r"[._]", "-", flag.lower()) if flag.startswith("--") else flag
+    first, _, last = flag.lower().lstrip("-").replace("_", "-").rpartition(".")
+    for name in dict.fromkeys((whole, f"--{last}", f"--{first}")) if first else (whole,):
+        meant = next((one for one in (name, *MEANT.get(name, ())) if one in known), None)
+        told = f" {TOLD[name]}" if name in TOLD and meant in (None, "--set") else ""
+        if meant is not None:
+            return f" Did you mean '{meant}'?{told}"
+        if told:
+            return told
+    names = [one.lstrip("-") for one in known]
+    close = difflib.get_close_matches(whole.lstrip("-"), names, n=1, cutoff=CLOSE)
+    return f" Did you mean '--{close[0]}'?" if close else ""
 
 
 def about_choice(value: object, choices: Iterable[object]) -> str:
