@@ -1,5 +1,7 @@
 """How workers begin: what they know of the parent's environment, and what becomes of them without it."""
 
+import gc
+import importlib.metadata
 import os
 import signal
 import subprocess
@@ -12,6 +14,7 @@ import pytest
 
 from tests.waiting import is_alive, wait_until
 from vla_eval.workers import start as worker_start
+from vla_eval.workers.server import IMPORTS_VARIABLE, import_for_workers
 from vla_eval.workers.start import begin, simulator_modules, worker_context, worker_environment
 
 PARENT = """
@@ -66,6 +69,25 @@ def test_a_worker_collects_its_own_garbage_and_nothing_that_was_imported_before_
     is_enabled, n_left_out = in_a_worker("(gc.isenabled(), gc.get_freeze_count())")
     assert is_enabled
     assert n_left_out > 0
+
+
+def test_imports_for_workers_look_once_for_what_is_installed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asking = "import importlib.metadata\nfound = importlib.metadata.packages_distributions()\n"
+    for name in ("asks_first", "asks_again"):
+        (tmp_path / f"{name}.py").write_text(asking)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv(IMPORTS_VARIABLE, "asks_first:there_is_no_such_module:asks_again")
+    original = importlib.metadata.packages_distributions
+    try:
+        import_for_workers()
+    finally:
+        gc.unfreeze()
+    first, again = (sys.modules.pop(name) for name in ("asks_first", "asks_again"))
+    assert first.found is again.found
+    assert "numpy" in first.found
+    assert importlib.metadata.packages_distributions is original
 
 
 def test_where_there_is_an_nvidia_driver_nothing_is_forked(monkeypatch: pytest.MonkeyPatch) -> None:

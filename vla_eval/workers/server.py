@@ -1,9 +1,11 @@
 """Imported by the process that workers are forked from; see `vla_eval.workers.start`."""
 
 import contextlib
+import functools
 import gc
-import importlib
+import importlib.metadata
 import os
+from collections.abc import Iterator
 
 from vla_eval.lock.state import code_folders
 from vla_eval.workers.guard import end_with_parent
@@ -21,12 +23,24 @@ def import_for_workers() -> None:
     What is there at the end is left out of every later collection, so that workers keep sharing its memory.
     """
     gc.disable()
-    for name in filter(None, os.environ.get(IMPORTS_VARIABLE, "").split(":")):
-        with contextlib.suppress(Exception):
-            importlib.import_module(name)
+    with _packages_asked_for_once():
+        for name in filter(None, os.environ.get(IMPORTS_VARIABLE, "").split(":")):
+            with contextlib.suppress(Exception):
+                importlib.import_module(name)
     code_folders()  # resolves the folder of each module, so that no worker has to
     gc.freeze()
     gc.enable()
+
+
+@contextlib.contextmanager
+def _packages_asked_for_once() -> Iterator[None]:
+    """Let Python look only once for what is installed: transformers and diffusers ask, 0.7 CPU s each."""
+    original = importlib.metadata.packages_distributions
+    setattr(importlib.metadata, "packages_distributions", functools.cache(original))  # noqa: B010
+    try:
+        yield
+    finally:
+        setattr(importlib.metadata, "packages_distributions", original)  # noqa: B010
 
 
 if IMPORTS_VARIABLE in os.environ:  # else this module is imported for its names
