@@ -18,7 +18,7 @@ from vla_eval.tasks.interface import StepRange
 from vla_eval.tasks.memory_env import CueSize, Place, Wxyz, poses
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects import mug as mugs
-from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere, pose_of
+from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere, pose_of, position_of_one
 from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
 
@@ -126,14 +126,17 @@ class ShellGameEnv(ChoiceEnv):
     def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         choice_begins = mask & (step == self._response_step)
         cue_begins = mask & (step == self.cue_after_steps) & (step > 0) & (step < self._cue_end_step)
-        self._put_ball_under(self._of_target(self._slots), cue_begins & self.show_cue)
+        if anywhere(cue_begins):
+            self._put_ball_under(self._of_target(self._slots), cue_begins & self.show_cue)
         begun = self._cue_end_step if self.show_cue else np.zeros_like(self._cue_end_step)
         hidden = mask & (step >= begun) & (step < self._response_step)
         self.reveal(choice_begins, self._mug_orientation_wxyz())
         # Between cue and choice the ball is hidden; later it moves with its mug.
-        self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
+        if anywhere(hidden):
+            self.move(self.ball, hidden, self.parking_pose("ball", half_height_m=BALL_RADIUS_M))
         covered = mask & (step >= self._response_step)
-        self._put_ball_under(self._of_target(self.candidate_positions_m()), covered)
+        if anywhere(covered):
+            self._put_ball_under(position_of_one(self.candidates, self._target), covered)
         return anywhere(cue_begins | choice_begins | hidden | covered)
 
     def _privileged_extra(self) -> Info:
@@ -165,4 +168,5 @@ class ShellGameTouchEnv(ShellGameEnv):
 
     def reward_terms(self, info: Info) -> Info:
         """As in `ChoiceEnv`, but nothing before the mugs stand there (official code)."""
-        return {name: term * self.response_begun() for name, term in super().reward_terms(info).items()}
+        begun = self.response_begun()
+        return {name: term * begun for name, term in super().reward_terms(info).items()}

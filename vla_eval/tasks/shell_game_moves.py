@@ -20,6 +20,7 @@ from vla_eval.tasks.objects.bodies import (
     length,
     moving_body,
     pose_of,
+    position_of_one,
     resting_body,
     velocity_of,
     yaw_rad,
@@ -65,7 +66,7 @@ class ShellGameMoveEnv(ShellGameEnv):
         return goals + np.array(self._goal_offset_m(), dtype=np.float32)
 
     def _target_to_goal_m(self) -> FloatArray:
-        return self._of_target(self.goal_positions_m() - self.candidate_positions_m())
+        return self._of_target(self.goal_positions_m()) - position_of_one(self.candidates, self._target)
 
     def is_placed(self, reach_m: FloatArray) -> Flags:
         """Return (B,) bool: the right mug is within the threshold of its goal."""
@@ -144,7 +145,8 @@ class ShellGamePushEnv(ShellGameMoveEnv):
         to_goal_m = length(self._target_to_goal_m())
         terms = super().reward_terms(info)
         terms["pushing"] = 2 * nearness(5.0, to_goal_m) * (reach_m <= PUSH_REACH_M)
-        return {name: term * self.response_begun() for name, term in terms.items()}
+        begun = self.response_begun()
+        return {name: term * begun for name, term in terms.items()}
 
 
 class ShellGamePickEnv(ShellGameMoveEnv):
@@ -194,8 +196,9 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         """Return (B,) bool: the right mug has been lifted high enough."""
         if self.goal_is_a_point:
             return super().is_placed(reach_m)
-        risen_m = self._of_target(self.candidate_positions_m() - self._slots)[:, 2]
-        return self.response_begun() & (risen_m >= self.lift_height_m)
+        risen_m = position_of_one(self.candidates, self._target) - self._of_target(self._slots)
+        risen: Flags = self.response_begun() & (risen_m[:, 2] >= self.lift_height_m)
+        return risen
 
     def _chosen_m(self) -> float:
         needed_m = self.lift_height_m - (self.goal_threshold_m if self.goal_is_a_point else 0.0)
@@ -227,7 +230,8 @@ class ShellGamePickEnv(ShellGameMoveEnv):
             "slowing": 5 * nearness(5.0, self.arm_speed()) * (placed & near),
             "resting": 5.0 * (info["is_robot_static"] & placed & near),
         }
-        return {name: term * self.response_begun() for name, term in terms.items()}
+        begun = self.response_begun()
+        return {name: term * begun for name, term in terms.items()}
 
     def _privileged_extra(self) -> Info:
         return {**super()._privileged_extra(), "is_grasped": self._is_grasped()[:, None]}

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from mani_skill.envs.sapien_env import BaseEnv
 from mani_skill.utils.geometry.rotation_conversions import matrix_to_euler_angles, quaternion_to_matrix
+from mani_skill.utils.sapien_utils import get_pairwise_contacts
 
 from vla_eval.control_modes import ABSOLUTE_MODES, EE_POSE, JOINT_POS
 from vla_eval.core import FloatArray
@@ -108,9 +109,10 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         """Return (B,) bool: both fingers press an actor, with at least 0.5 N (ManiSkill's rule)."""
         if not self.gpu_sim_enabled:
             # Its rule takes 0.5 ms; most of the time a finger does not touch the actor at all.
+            contacts, held = self.scene.px.get_contacts(), actor._bodies[0].entity
             fingers = (self.agent.finger1_link, self.agent.finger2_link)
-            forces_n = (self.scene.get_pairwise_contact_forces(finger, actor) for finger in fingers)
-            if any(not bool(force_n.any()) for force_n in forces_n):
+            touches = (get_pairwise_contacts(contacts, one._bodies[0].entity, held) for one in fingers)
+            if not all(touches):
                 return np.zeros(1, dtype=np.bool_)
         grasped: Flags = self.agent.is_grasping(actor).cpu().numpy()
         return grasped
