@@ -23,6 +23,7 @@ from vla_eval.testing.check_env import check_env
 TASK = "RememberColor3-v0"
 MODES = tuple(CONTROL_MODES)
 FETCH = {"robot_uids": FETCH_UID}
+BEFORE_THE_CHOICE = ("freeze_until_choice", "move_in_delay")
 
 
 def env_in(mode: str, task: str = TASK, **kwargs: Any) -> Any:
@@ -68,20 +69,28 @@ def test_the_arm_moves_as_with_maniskill_s_own_controllers_to_the_last_bit(
     assert np.ptp(states[0][:-1:2], axis=0).max() > 0.1, "the arm did not move"
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_arms_that_step_together_move_as_each_does_alone_to_the_last_bit(mode: str) -> None:
+@pytest.mark.parametrize(
+    ("mode", "arguments"),
+    [*((mode, {}) for mode in MODES), *((EE_DELTA_POSE, {event: True}) for event in BEFORE_THE_CHOICE)],
+)
+def test_arms_that_step_together_move_as_each_does_alone_to_the_last_bit(
+    mode: str, arguments: dict[str, bool]
+) -> None:
     space, n_slots, n_steps = CONTROL_MODES[mode], 3, 25
     drawn = np.random.default_rng(1).uniform(space.low, space.high, (n_steps, n_slots, len(space.dims)))
     actions = (drawn * 1.2).astype(np.float32)
     actions[:, :, :3] *= np.array([1, 0.1, 0], dtype=np.float32)[:, None]  # long, short, no translation
 
     def states(slots: tuple[int, ...]) -> dict[int, list[FloatArray]]:
-        env: Any = make_env(EnvSettings(task=TASK, kwargs={"control_mode": mode}, n_slots=n_slots))
+        env: Any = make_env(
+            EnvSettings(task=TASK, kwargs={"control_mode": mode, **arguments}, n_slots=n_slots)
+        )
         env.reset({slot: 5 + slot for slot in slots}, render=False)
         found: dict[int, list[FloatArray]] = {slot: [] for slot in slots}
         for step in range(n_steps):
             # The last episode ends before the others.
-            asked = {slot: actions[step, slot] for slot in slots if slot < n_slots - 1 or step < n_steps // 2}
+            going = [slot for slot in slots if slot < n_slots - 1 or step < n_steps // 2]
+            asked = {slot: actions[step, slot] for slot in going}
             for slot, result in env.step(asked, render=frozenset()).items():
                 found[slot] += [*result.observation.state.values(), env.joint_targets(slot)]
         env.close()

@@ -148,12 +148,8 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
         """Return the (B, J) joint positions, rad, at which the arm aims since the last action."""
         return to_array(self.agent.controller.controllers["arm"]._target_qpos)
 
-    # ---------------------------------------------------------------- the three parts of a control step
-    # Environments that step together do each part in turn: what it needs is then in the processor's caches.
-
-    def drive(self, actions: FloatArray) -> None:
-        """Give (B, A) float32 actions to the controllers, see `drive_together`."""
-        drive_together([self], actions)
+    # A control step is `drive_together`, `simulate` and `finish`. Environments that step together do each of
+    # them in turn: what it needs is then in the processor's caches.
 
     def simulate(self) -> None:
         """Let the time of one control step pass."""
@@ -184,7 +180,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             self.executed_action = None
             return super()._step_action(action)
         given = to_array(action) if torch.is_tensor(action) else np.asarray(action, dtype=np.float32)
-        self.drive(given.reshape(self.num_envs, -1))
+        drive_together([self], given.reshape(self.num_envs, -1))
         self.simulate()
         if not self.gpu_sim_enabled:
             self._after_control_step()
@@ -217,16 +213,14 @@ def drive_together(envs: Sequence[ArmControl], actions: FloatArray) -> None:
     """
     if anywhere(np.isnan(actions)):
         raise ValueError(f"An action is not a number: {actions.tolist()}.")
-    first, n_rows = envs[0], len(actions) // len(envs)
-    blocks = [slice(i * n_rows, (i + 1) * n_rows) for i in range(len(envs))]
+    first, by_env = envs[0], (len(envs), -1, actions.shape[1])
     if first.freeze_until_choice or first.move_in_delay:
-        actions = np.concatenate(
-            [env._replaced(actions[rows]) for env, rows in zip(envs, blocks, strict=True)]
-        )
+        of_envs = zip(envs, actions.reshape(by_env), strict=True)
+        actions = np.concatenate([env._replaced(rows) for env, rows in of_envs])
     space = first.single_action_space
     executed = np.minimum(np.maximum(actions, space.low), space.high)
-    for env, rows in zip(envs, blocks, strict=True):
-        env.executed_action = executed[rows]
+    for env, rows in zip(envs, executed.reshape(by_env), strict=True):
+        env.executed_action = rows
     # ManiSkill clips only numbers that it scales.
     driven = executed if first.control_mode in ABSOLUTE_MODES else actions
     if first.gpu_sim_enabled:
