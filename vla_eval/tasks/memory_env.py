@@ -314,9 +314,8 @@ class MemoryTableEnv(TensorsOut):
             one = isinstance(poses, sapien.Pose)
             actor.set_pose(poses if one else Pose.create(torch.as_tensor(poses[mask], device=self.device)))
             if actor.px_body_type == "dynamic":
-                zero = torch.zeros(3, device=self.device)
-                actor.set_linear_velocity(zero)
-                actor.set_angular_velocity(zero)
+                for set_velocity in (actor.set_linear_velocity, actor.set_angular_velocity):
+                    set_velocity(torch.zeros(3, device=self.device))
 
     # ---------------------------------------------------------------- reading
 
