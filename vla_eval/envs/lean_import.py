@@ -7,18 +7,16 @@ that ManiSkill does not import while it is imported, or that are not plain Pytho
 import contextlib
 import sys
 import threading
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from importlib.abc import Loader, MetaPathFinder
-from importlib.machinery import ModuleSpec, PathFinder, SourceFileLoader
+from importlib.machinery import PathFinder, SourceFileLoader
 from types import ModuleType
-from typing import Any
+from typing import Any  # specs of modules, and what is in modules
 
-LATER = frozenset(
-    {
-        *("matplotlib.pyplot", "matplotlib.animation"),  # to show images
-        "mani_skill.utils.download_asset",  # brings a client for the Hub
-        *("scipy.optimize", "scipy.ndimage", "trimesh.nsphere", "trimesh.path.simplify"),  # by trimesh
-    }
+LATER = (
+    *("matplotlib.pyplot", "matplotlib.animation"),  # to show images
+    "mani_skill.utils.download_asset",  # brings a client for the Hub
+    *("scipy.optimize", "scipy.ndimage", "trimesh.nsphere", "trimesh.path.simplify"),  # by trimesh
 )
 _running = threading.RLock()
 
@@ -28,52 +26,42 @@ class _LaterModule(ModuleType):
 
     def __getattr__(self, name: str) -> Any:
         with _running:  # other threads wait until it has run
-            spec = self.__spec__
-            if type(self) is _LaterModule and not vars(self).get("__running__"):
-                assert spec is not None and spec.loader is not None  # as `_Finder` made it
-                vars(self)["__running__"] = True
+            own, spec = vars(self), vars(self)["__spec__"]
+            if type(self) is _LaterModule and not own.get("__running__"):
+                own["__running__"] = True
                 if spec.submodule_search_locations is not None:
-                    self.__path__ = spec.submodule_search_locations
+                    own["__path__"] = spec.submodule_search_locations
                 try:
                     spec.loader.exec_module(self)
                     self.__class__ = ModuleType  # type: ignore[assignment]
                 finally:
-                    del vars(self)["__running__"]
+                    del own["__running__"]
         return ModuleType.__getattribute__(self, name)
 
 
-class _LaterLoader(Loader):
-    """Leaves a module as it was found."""
+class _Later(MetaPathFinder, Loader):
+    """Finds modules, and leaves them as it found them."""
 
-    def __init__(self, loader: Loader) -> None:
-        self._loader = loader
-
-    def exec_module(self, module: ModuleType) -> None:
-        assert module.__spec__ is not None
-        module.__spec__.loader = module.__loader__ = self._loader
-        if module.__spec__.submodule_search_locations is not None:
-            del module.__path__  # so that the import of a submodule runs its package first
-        module.__class__ = _LaterModule
-
-
-class _Finder(MetaPathFinder):
     def __init__(self, names: Collection[str]) -> None:
         self._names = names
 
-    def find_spec(
-        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
-    ) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Any, target: Any = None) -> Any:
         spec = PathFinder.find_spec(fullname, path, target) if fullname in self._names else None
         if spec is None or type(spec.loader) is not SourceFileLoader:
             return None  # the other finders decide
-        spec.loader = _LaterLoader(spec.loader)
+        spec.loader_state, spec.loader = spec.loader, self
         return spec
+
+    def exec_module(self, module: Any) -> None:
+        module.__spec__.loader = module.__loader__ = module.__spec__.loader_state
+        vars(module).pop("__path__", None)  # so that the import of a submodule runs its package first
+        module.__class__ = _LaterModule
 
 
 @contextlib.contextmanager
 def running_later(names: Collection[str]) -> Iterator[None]:
     """Let the modules of these names that are imported in the context run when they are first used."""
-    finder = _Finder(names)
+    finder = _Later(names)
     sys.meta_path.insert(0, finder)
     try:
         yield
