@@ -283,6 +283,8 @@ def test_numbers_of_numpy_are_numbers(tmp_path: Path) -> None:
     ("call", "words"),
     [
         (lambda: vla_eval.evaluate(policy="oracle", task=TASK), "'task'. Did you mean 'tasks'?"),
+        (lambda: vla_eval.evaluate(policy="oracle", tasks=TASK, device="cuda"), "args: {device: cuda}"),
+        (lambda: vla_eval.evaluate(policy="oracle", tasks=TASK, max_steps=9), "env.horizon_steps"),
         (lambda: vla_eval.check_policy(Bare()), "`act` returns an ActionChunk. Found: ndarray."),
     ],
 )

@@ -5,8 +5,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any  # plain data, whatever the user gives
 
+from vla_eval.cli.shared.slips import TOLD
 from vla_eval.config.files import Folder, to_data
-from vla_eval.errors import RecipeError, check_names
+from vla_eval.errors import RecipeError, UnknownNameError, check_names
 from vla_eval.tasks.configured import read_configured
 
 
@@ -42,7 +43,11 @@ def configured[C](
         edit(data)
 
     def check(data: dict[str, Any]) -> None:
-        check_names("field", data, [one.name for one in fields(cls)], where=where)  # type: ignore[arg-type]
+        known = [one.name for one in fields(cls)]  # type: ignore[arg-type]
+        for name in data:
+            if name not in known and (told := TOLD.get(f"--{name}".replace("_", "-"))):
+                raise UnknownNameError(f"{where}: there is no field '{name}'. {told}")
+        check_names("field", data, known, where=where)
         missing = [argument for field, argument in needed.items() if field not in data]
         if missing:
             raise RecipeError(
