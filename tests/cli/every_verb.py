@@ -60,7 +60,7 @@ COMMANDS = {
     "list": "list",
     "show": f"show {TASK}",
     "doctor": "doctor --json",
-    "bench --loader": "bench --loader --samples 8 --repeats 1",
+    "bench --loader": f"bench --loader {{W}}/data/{TASK} --policy diffusion_small --batches 1 --repeats 1",
     # Its own server of a policy that computes nothing imports torch and lerobot; one of them is enough.
     "bench --serve": "bench --serve random --sessions 1 --seconds 0.1",
     "completion": "completion bash",

@@ -141,7 +141,7 @@ def test_an_audit_is_refused_before_it_starts(
         (["--repeats", "0"], "repeats is 0"),
         (["--repeats", "1000000000"], "repeats is 1000000000"),
         (["--n-action-steps", "0"], "n_action_steps is 0"),
-        (["--loader", "--samples", "0"], "samples is 0"),
+        (["--loader", "--batches", "0"], "batches is 0"),
         (["--loader", "--repeats", "0"], "repeats is 0"),
         (["--serve", "--sessions", "1", "0"], "sessions is 0"),
         (["--serve", "--seconds", "0"], "seconds is 0"),
@@ -156,4 +156,4 @@ def test_a_bench_is_refused_before_it_starts(
 def test_a_bench_takes_what_it_takes_by_default() -> None:
     args = build_parser(("bench",)).parse_args(["bench"])
 
-    assert (args.repeats, args.samples, args.n_action_steps) == (2, 200, [1, 4, 8])
+    assert (args.repeats, args.batches, args.n_action_steps) == (2, 4, [1, 4, 8])

@@ -118,7 +118,7 @@ class _Training:
         torch.backends.cudnn.benchmark = True
         torch.backends.cuda.matmul.allow_tf32 = True
         with accelerator.main_process_first():  # the others find the decoded frames
-            dataset = _dataset(job, self.config)
+            dataset = dataset_of(job, self.config)
         self.images = getattr(dataset, "image_fields", dataset.meta.camera_keys)
         self.tracker, self.readings = new_tracker(job, dataset, accelerator), Readings()
         set_seed(job.run_seed)
@@ -129,7 +129,7 @@ class _Training:
         is_sharded = accelerator.distributed_type == DistributedType.FSDP
         if job.resume_from is not None:
             load_state(job.resume_from, optimizer, scheduler, load_optimizer=not is_sharded)
-        loader = _loader(job, self.config, dataset, accelerator)
+        loader = loader_of(job, self.config, dataset, accelerator)
         self.policy, self.optimizer, self.scheduler = accelerator.prepare(model, optimizer, scheduler)
         if job.resume_from is not None and is_sharded:
             load_fsdp_optimizer_state(self.policy, self.optimizer, job.resume_from)
@@ -221,7 +221,7 @@ def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
     return LAUNCHED.get(os.environ.get(LAUNCHED_PRECISION, ""))
 
 
-def _dataset(job: TrainingJob, config: Any) -> Any:
+def dataset_of(job: TrainingJob, config: Any) -> Any:
     """Return lerobot's dataset, or one that serves the same from decoded frames."""
     with job.dataset.local.readers():
         dataset = make_dataset(config)
@@ -233,7 +233,7 @@ def _dataset(job: TrainingJob, config: Any) -> Any:
     return dataset
 
 
-def _loader(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerator) -> Any:
+def loader_of(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerator) -> Any:
     """Return an endless loader of this process's batches, from the job's first step on."""
     episodes = dataset.meta.episodes
     sampler = EpisodeAwareSampler(

@@ -103,9 +103,7 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         """Return one sample; every tensor in it is a new one."""
         if not -len(self) <= index < len(self):
             raise IndexError(f"sample {index} of {len(self)}")
-        index %= len(self)
-        if self._whole_episodes:
-            index = int(self._bounds[index, 1]) - 1
+        index = self.served(index % len(self))
         fields = {
             key: column[index].clone() if isinstance(column, torch.Tensor) else column[index]
             for key, column in self._columns.items()
@@ -118,6 +116,10 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
         sample = {**self._images(index, rows), **fields}
         sample["task"] = self.meta.tasks.iloc[fields["task_index"].item()].name
         return sample
+
+    def served(self, index: int) -> int:
+        """Return which of the source's samples a sample is; another one only with `whole_episodes`."""
+        return int(self._bounds[index, 1]) - 1 if self._whole_episodes else index
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave mapped files behind: another process maps them itself."""
