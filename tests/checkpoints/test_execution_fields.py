@@ -190,6 +190,7 @@ VALUES = {
     "rtc_ramp_rate": 2.5,
     "per_episode_seed": True,
     "eval_seed": 17,
+    "compile_model": True,
 }
 
 

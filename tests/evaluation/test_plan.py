@@ -1,8 +1,10 @@
 """What an evaluation will run, in which order, and what two runs are compared by."""
 
+import json
 from collections import Counter
 from hashlib import sha256
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -21,9 +23,12 @@ from vla_eval.errors import (
 from vla_eval.evaluation import plan as planning
 from vla_eval.evaluation import worker
 from vla_eval.evaluation.job_queue import JobQueue
+from vla_eval.evaluation.resolve import resolve
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import TASKS, task_spec
+
+LEROBOT = {"version": 2, "description": "d", "adapter": "lerobot", "args": {"checkpoint": "none"}}
 
 
 class TestPlan:
@@ -132,6 +137,24 @@ class TestPlan:
         }.items():
             assert fingerprint(config(**{field: value})) != fingerprint(base), field
         assert {"workers", "timeouts", "name"}.isdisjoint(results_config(base))
+
+    def test_a_compiled_network_is_another_run_and_one_that_is_not_has_the_digest_that_it_had(
+        self, tmp_path: Path
+    ) -> None:
+        (tmp_path / "mine.yaml").write_text(json.dumps(LEROBOT))
+        fields: dict[str, Any] = {"policies": [str(tmp_path / "mine.yaml"), "oracle"]}
+        plain, compiled = (resolve(config(**fields, compile=value)) for value in (False, True))
+
+        assert "compile" not in plain.results_config
+        assert plain.fingerprint == resolve(config(**fields)).fingerprint != compiled.fingerprint
+        assert [entry.value.args.get("compile") for entry in compiled.policies] == [True, None]
+        assert [entry.recipes[0].sha256 for entry in compiled.policies] == [
+            entry.recipes[0].sha256 for entry in plain.policies
+        ]
+
+    def test_to_compile_is_refused_where_no_policy_has_a_network(self) -> None:
+        with pytest.raises(RecipeError, match=r"compile: expected a policy with a checkpoint, found random"):
+            resolve(config(policies=["random"], compile=True))
 
     def test_plain_data_can_be_decoded_again(self) -> None:
         original = config(n_action_steps=[1, 2], env={"velocity_range_m_s": [0.1, 0.2]})

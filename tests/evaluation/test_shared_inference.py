@@ -19,6 +19,7 @@ from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
 from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.records import EpisodeRecord
+from vla_eval.storage.run_folder import read_run
 from vla_eval.workers import local
 from vla_eval.workers.load import Load
 
@@ -123,6 +124,42 @@ def test_the_choice_is_part_of_what_a_run_is_resumed_with(network: Bench) -> Non
     with pytest.raises(RunChangedError, match="inference_max_batch"):
         shared(network, "out", inference_max_batch=ROWS + 1)
     shared(network, "out", workers=2)
+
+
+WARMS_UP = """
+import threading
+from vla_eval.policies.compiled import Compilation
+
+
+def warm_up(policy, env, sentences):
+    policy.thread = threading.get_ident()
+    return Compilation(seconds=1.0, n_rows=policy.n_rows, precision="float32", difference=0.002, scale=0.9)
+
+
+def act_batch(policy, windows):
+    assert threading.get_ident() == policy.thread, "CUDA graphs belong to the thread that made them"
+    return plain(policy, windows)
+
+
+plain, Policy.act_batch, Policy.warm_up = Policy.act_batch, act_batch, warm_up
+"""
+
+
+@pytest.mark.parametrize("where", ["in_process", "shared"])
+def test_a_network_is_compiled_in_the_thread_that_asks_it_and_tables_say_how_far_it_is_off(
+    network: Bench, where: str
+) -> None:
+    module = network.folder / "net_policy.py"
+    module.write_text(NETWORK_MODULE.replace("def make(", f"{WARMS_UP}\n\ndef make("))
+    n_rows = ROWS if where == "shared" else 1
+
+    for episodes in (2, 4):  # said once, also where a run is continued
+        run(network, "out", inference=where, inference_max_batch=ROWS, workers=1, episodes=episodes)
+
+    notes = [note for session in read_run(network.folder / "out").sessions for note in session.sentences]
+    (note,) = notes
+    assert f"(float32, {n_rows} in a pass)" in note
+    assert "of at most 0.9, differ by at most 0.002" in note
 
 
 def test_a_policy_that_cannot_be_made_ends_the_run_with_its_cause(network: Bench) -> None:

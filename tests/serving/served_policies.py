@@ -97,7 +97,7 @@ def host(policy: Any, *, n_rows: int = 1) -> HostedPolicy:
         supports=SUPPORTS,
         versions={},
     )
-    return HostedPolicy(policy=policy, metadata=metadata, reader=reader, task=ANY_TASK)
+    return HostedPolicy(policy=policy, metadata=metadata, reader=reader, task=ANY_TASK, env=env)
 
 
 def frame(**fields: Any) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from types import MappingProxyType
 from typing import Any  # JSON of another program
 
 from vla_eval.checkpoints.files import CONFIG_FILE, read_json
-from vla_eval.checkpoints.notes import checkpoint_folder
+from vla_eval.checkpoints.notes import COMPILE, checkpoint_folder
 from vla_eval.chunking import ChunkingSpec
 
 RTC = "real-time chunking is of LeRobot's rollouts; here a chunk does not depend on the one before"
@@ -34,6 +34,9 @@ EXECUTION_FIELDS: Mapping[str, Answer] = MappingProxyType(
         "rtc_ramp_rate": Answer(instead=RTC),
         "per_episode_seed": Answer(instead=DRAWS, off=False),
         "eval_seed": Answer(instead=DRAWS),
+        "compile_model": Answer(
+            instead="the network is computed as it is. Compiled: --set compile=true", off=False
+        ),
     }
 )
 """Field -> how it is answered."""
@@ -61,6 +64,7 @@ def ignored_fields(
         and (value := data.get(name)) not in (None, False)
         and not (isinstance(value, dict) and value.get("enabled") is False)
         and not (name == "temporal_ensemble_coeff" and _ensembles(chunking, value))
+        and not (name == "compile_model" and args.get(COMPILE))
     )
 
 

@@ -17,7 +17,7 @@ from vla_eval.checkpoints.files import (
     read_json,
     unreadable,
 )
-from vla_eval.checkpoints.policy_types import asked_for_steps
+from vla_eval.checkpoints.policy_types import asked_for_steps, check_compiled
 from vla_eval.checkpoints.saved_processor import SavedStep, read_saved_processor
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.models.families import FAMILIES
@@ -30,6 +30,8 @@ LEROBOT_CHECKPOINTS = frozenset(
     {LEROBOT_ADAPTER, *(name for family in FAMILIES.values() for name in family.adapters)}
 )
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
+COMPILE = "compile"
+"""Their argument that asks for a compiled network."""
 
 NEEDED_STATISTICS: Mapping[str, tuple[str, ...]] = {
     "MEAN_STD": ("mean", "std"),
@@ -61,7 +63,10 @@ def known_chunk_size(adapter: str, args: Mapping[str, Any], *, recipe: str) -> i
         return None
     where = str(folder / CONFIG_FILE)
     data = read_json(folder / CONFIG_FILE)
-    if asked_for_steps(get_text(data, "type", where=where)):
+    kind = get_text(data, "type", where=where)
+    if args.get(COMPILE):
+        check_compiled(str(kind), policy=recipe)
+    if asked_for_steps(kind):
         return 1
     return get_count(data, "chunk_size", maximum=MAX_ACTIONS, where=where)
 

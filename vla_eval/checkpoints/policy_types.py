@@ -11,6 +11,21 @@ def asked_for_steps(kind: str | None) -> bool:
     return bool(family_of(str(kind)).queues)
 
 
+def check_compiled(kind: str, *, policy: str) -> None:
+    """Refuse to compile the network of a type that is known not to gain by it."""
+    family = family_of(kind)
+    why_not = family.not_compiled or ("it is asked for one action at a time" if family.queues else "")
+    if why_not:
+        raise cannot_compile(kind, why_not, policy=policy)
+
+
+def cannot_compile(kind: str, why_not: str, *, policy: str) -> SpecMismatchError:
+    """Return the error of a policy whose network is not compiled."""
+    return SpecMismatchError(
+        f"policy '{policy}': the network of a '{kind}' is not compiled: {why_not}. Leave `compile` out."
+    )
+
+
 def chunk_size(config: Any) -> int:
     """Return how many actions a chunk has from the observed step on; earlier ones are of no use.
 

@@ -5,11 +5,15 @@ import ipaddress
 import logging
 import os
 import sys
+from typing import TYPE_CHECKING
 
 from vla_eval.cli.shared.arguments import api_key_of, task_argument
 from vla_eval.errors import MAX_SHOWN
 from vla_eval.strict.devices import check_device
 from vla_eval.workers.start import WORKER_ENVIRONMENT
+
+if TYPE_CHECKING:
+    from vla_eval.policies.compiled import Compilation
 
 DESCRIPTION = """Serve a policy over WebSocket, until Ctrl-C or SIGTERM. `mikasa-vla eval --policy ws://HOST:PORT`
 evaluates it, and openpi's own client gets chunks from it. Requests of several clients share a pass of the
@@ -46,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--device", type=check_device, metavar="D", help="auto, cpu, cuda, cuda:1 (the recipe's)"
     )
+    parser.add_argument("--compile", action="store_true", help="compile its network first (docs/serve.md)")
     parser.add_argument("--debug", action="store_true", help="send errors with their traceback")
 
 
@@ -83,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
             n_action_steps=args.n_action_steps,
             max_batch=args.max_batch,
             device=args.device,
+            compile=args.compile,
         )
     )
     for line in hosted.ignored:
@@ -92,7 +98,12 @@ def run(args: argparse.Namespace) -> int:
     def ready(port: int) -> None:
         print(f"Serving {hosted.metadata.name} at ws://{host}:{port}", flush=True)
 
-    run_server(hosted, options, ready=ready)
+    def compiled(found: "Compilation") -> None:
+        print(
+            f"{found.note(hosted.metadata.name or args.policy)}. That took {found.seconds:.0f} s.", flush=True
+        )
+
+    run_server(hosted, options, ready=ready, on_compiled=compiled)
     return 0
 
 

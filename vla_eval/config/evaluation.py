@@ -102,6 +102,7 @@ class EvalConfig:
     slots_per_worker: Slots = 1
     inference: Literal["auto", "in_process", "shared"] = "auto"
     inference_max_batch: Annotated[int, Bounds(1, MAX_SERVER_ROWS)] = 8
+    compile: bool = False
     workers: Workers = "auto"
     timeouts: TimeoutConfig = field(default_factory=TimeoutConfig)
     max_consecutive_errors: Episodes = 10

@@ -20,7 +20,7 @@ from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.evaluation.server_phases import ReadyPhase, phases, with_servers
-from vla_eval.evaluation.worker import Finished, SentenceRead
+from vla_eval.evaluation.worker import Finished, NetworkCompiled, SentenceRead
 from vla_eval.models.shared.sentence_reading import SentenceWatch
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
@@ -181,6 +181,8 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
             with with_servers(phase, resolved, plan, logs=logs, stops=stops) as ready:
                 if ready is None:
                     return True
+                for note in () if ready.servers is None else ready.servers.notes:
+                    bookkeeper.folder.note(note)
                 bookkeeper.queue = JobQueue(ready.jobs, finished={*finished, *bookkeeper.keys})
                 size = worker_count(resolved, plan, n_jobs=bookkeeper.queue.n_batches)
                 pool: EpisodePool = resolved.backend.pool(spec, size=size)
@@ -218,6 +220,8 @@ def _run(
             elif isinstance(event, DeviceFound):
                 bookkeeper.folder.note_device(event.device)
                 bookkeeper.observer.on_device(event.device)
+            elif isinstance(event, NetworkCompiled):
+                bookkeeper.folder.note(event.note)
             elif isinstance(event, SentenceRead):
                 bookkeeper.note_sentence(event)
             else:
@@ -288,7 +292,7 @@ class _Bookkeeper:
         """Say what was cut of a sentence, and which tasks became one; all workers find it."""
         watch = self.sentences.setdefault(found.part, SentenceWatch(found.part))
         for line in watch.lines(found.reading, found.task):
-            self.folder.note_sentence(line)
+            self.folder.note(line)
             self.observer.on_warning(line)
 
     def _take_error(self, job: EpisodeJob, error: EpisodeError) -> None:

@@ -5,10 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self  # Any: plain data
 
+from vla_eval.checkpoints.notes import COMPILE, LEROBOT_CHECKPOINTS
 from vla_eval.config.appearance import AS_DESIGNED
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
-from vla_eval.config.files import content_of, digest_of
+from vla_eval.config.files import Recipe, content_of, digest_of
 from vla_eval.config.policy import PolicyRecipe
+from vla_eval.errors import RecipeError, some_of
 from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.recipe import bare_policy
 from vla_eval.storage.shard import Shard, shard_folder
@@ -42,6 +44,8 @@ class ResolvedEvaluation:
         shard: Shard | None = None,
     ) -> Self:
         """Decide where policies infer; arguments as for `resolve`, with the policies that were read."""
+        if config.compile:
+            policies = _compiled(policies)
         if config.inference == "auto":
             config = replace(
                 config, inference="shared" if _shares(config, policies, backend) else "in_process"
@@ -74,6 +78,8 @@ class ResolvedEvaluation:
         if config.inference == "in_process":
             data = {name: value for name, value in data.items() if name not in INFERENCE_FIELDS}
         data["policies"] = [bare_policy(name) for name in data["policies"]]
+        if not config.compile:
+            del data["compile"]
         if config.reset_policy_at_step is None:
             del data["reset_policy_at_step"]
         if config.chunking.first_inference_step == 0:
@@ -108,6 +114,27 @@ def resolve(
 def has_weights(recipe: PolicyRecipe) -> bool:
     """Whether a policy's recipe names a checkpoint: only such policies are shared."""
     return isinstance(recipe.args.get("checkpoint"), str)
+
+
+def _compiled(policies: Sequence[PolicyEntry]) -> tuple[PolicyEntry, ...]:
+    """Return the policies with `compile` in the arguments of those that load a checkpoint of LeRobot's."""
+    if not any(entry.value.adapter in LEROBOT_CHECKPOINTS for entry in policies):
+        raise RecipeError(
+            "compile: expected a policy with a checkpoint, found "
+            f"{some_of(entry.name for entry in policies)}. Leave it out. A policy server is started with it "
+            "(mikasa-vla serve --compile)."
+        )
+    return tuple(
+        replace(entry, recipes=tuple(map(_with_compile, entry.recipes)))
+        if entry.value.adapter in LEROBOT_CHECKPOINTS
+        else entry
+        for entry in policies
+    )
+
+
+def _with_compile(recipe: Recipe[PolicyRecipe]) -> Recipe[PolicyRecipe]:
+    value = recipe.value
+    return replace(recipe, value=replace(value, args={**value.args, COMPILE: True}))
 
 
 def _shares(config: EvalConfig, policies: Sequence[PolicyEntry], backend: Backend) -> bool:

@@ -73,7 +73,9 @@ def with_servers(
     from vla_eval.serving.shared import SharedServers
 
     config = resolved.config
-    options = HostOptions(policy=plan.shared[phase.policy], max_batch=config.inference_max_batch)
+    options = HostOptions(
+        policy=plan.shared[phase.policy], max_batch=config.inference_max_batch, compile=config.compile
+    )
     adapters = [job.group.adapter for job in phase.jobs[:1]]
     with SharedServers(
         options,

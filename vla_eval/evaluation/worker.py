@@ -25,6 +25,7 @@ from vla_eval.errors import (
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading
+from vla_eval.policies.compiled import CompiledPolicy
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
 from vla_eval.records import EpisodeError, EpisodeRecord, EpisodeTiming
@@ -58,6 +59,13 @@ class SentenceRead(Notice):
     part: str
     task: str
     reading: SentenceReading
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NetworkCompiled(Notice):
+    """The network of a policy was compiled; the note says how far its actions differ."""
+
+    note: str
 
 
 class _StepCount(StepObserver):
@@ -181,6 +189,10 @@ class EpisodeRunner:
             policy = make_policy(group)
             check_compatible(policy.spec, group.offered)
             group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
+            if isinstance(policy, CompiledPolicy):
+                compiled = policy.warm_up(group.offered, (group.instruction,))
+                if compiled is not None:
+                    self._tell(NetworkCompiled(note=compiled.note(group.part)))
             self._heartbeat("setup")
             # ManiSkill collects garbage at each reset, through all that the policy's libraries imported.
             gc.freeze()

@@ -22,6 +22,8 @@ TINY_POLICY: Mapping[str, Any] = {
     "dtype": "float32",
 }
 """Fields of a tiny policy of the π0 family."""
+_BY_TOKENS = "it writes its actions token by token, each in a pass of another shape"
+_HAS_MEMORY = "it is small, and its memory has other shapes at each step"
 _STAGES = "vla_eval.models.shared.stages"
 _STAND_INS = "vla_eval.testing.stand_ins"
 _TINY_PALIGEMMA = "vla_eval.testing.tiny_models:tiny_paligemma"
@@ -165,6 +167,7 @@ _ROWS = (
     Family(
         type="diffusion",
         cuts_chunk=True,
+        compiled=("diffusion.unet.forward",),  # its scheduler looks at each step's number
         noise="ddim",
         stages=f"{_STAGES}:resnet_and_unet",
         saved_per_linear=1.19,
@@ -180,6 +183,7 @@ _ROWS = (
         type="pi0_fast",
         noise=None,
         cuts_chunk=True,
+        not_compiled=_BY_TOKENS,
         stages=f"{_STAGES}:paligemma_alone",
         stand_in=f"{_STAND_INS}:paligemma_with_action_tokens",
         tiny=None,
@@ -221,6 +225,7 @@ _ROWS = (
     Family(type="groot", cuts_chunk=True),
     Family(type="molmoact2", cuts_chunk=True),
     Family(
+        not_compiled=_HAS_MEMORY,
         **_ours("memory", "positive_control"),
         saved_per_linear=1.91,
         counts_all_layers=True,
@@ -233,6 +238,7 @@ _ROWS = (
         tiny=Tiny(),
     ),
     Family(
+        not_compiled=_HAS_MEMORY,
         **_ours("sequence", "sequence_policies"),
         saved_per_linear=1.1,
         counts_all_layers=True,
@@ -244,6 +250,7 @@ _ROWS = (
     Family(
         **_ours("octo", "octo"),
         is_built_empty=True,
+        compiled=("network.transformer.forward", "network.head.sample"),  # prompts are embedded once
         stand_in_fields=BYTES,
         tiny=Tiny(recipe="octo_tiny"),
         **_converted("octo", "OctoOptions"),
@@ -260,6 +267,7 @@ _ROWS = (
     Family(
         **_ours("openvla", "openvla"),
         is_built_empty=True,
+        compiled=("network.actions",),  # of the continuous head
         stand_in_fields=BYTES,
         tiny=Tiny(recipe="openvla_oft_tiny"),
         **_converted("openvla", "OpenVLAOptions"),
@@ -283,6 +291,7 @@ _ROWS = (
     Family(
         **_ours("spatialvla", "spatialvla"),
         is_built_empty=True,
+        not_compiled=_BY_TOKENS,
         saved_per_linear=1.9,
         stand_in_fields={
             **BYTES,  # whose tokens have these numbers

@@ -74,6 +74,9 @@ class Family:
     queues: tuple[str, ...] = ()
     # why it can be asked neither for a chunk nor for a step of one of several episodes
     why_not: str = ""
+    # what is compiled where `compile` asks for it: functions of the policy, as `attribute.attribute`
+    compiled: tuple[str, ...] = ("predict_action_chunk",)
+    not_compiled: str = ""  # why it is not
     cuts_chunk: bool = False  # its `predict_action_chunk` returns `n_action_steps` actions and no more
     noise: Noise | None = None  # what it can be given in place of its own draws
     lora_targets: str | None = None  # modules that get an adapter, where lerobot's own choice is wrong

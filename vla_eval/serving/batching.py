@@ -9,7 +9,7 @@ import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
@@ -68,7 +68,10 @@ _Request = _Begin | _Infer | _Forget
 
 
 class Batcher:
-    """Asks a policy on behalf of many, with `n_rows` in a pass; nobody else may call it any more."""
+    """Asks a policy on behalf of many, with `n_rows` in a pass; nobody else may call it any more.
+
+    `prepare` is called first, in the thread that asks; `prepared` has what it raises.
+    """
 
     def __init__(
         self,
@@ -77,14 +80,17 @@ class Batcher:
         n_rows: int,
         action_dims: Sequence[str],
         metrics: ServerMetrics,
+        prepare: Callable[[], object] = lambda: None,
     ) -> None:
         self._policy, self._n_rows, self._metrics = policy, n_rows, metrics
         self._action_dims = action_dims
         self._queue: deque[_Request] = deque()
         self._changed = threading.Condition()
         self._is_closed = False
+        self._prepare_thread = prepare
         self._unready: dict[int, PolicyFailure] = {}  # slots whose episode could not be begun
         self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
+        self.prepared: Future[None] = Future()
         self._thread.start()
 
     def begin(self, start: EpisodeStart) -> Future[None]:
@@ -120,6 +126,12 @@ class Batcher:
         return request
 
     def _work(self) -> None:
+        try:
+            self._prepare_thread()
+        except BaseException as exc:  # also SystemExit: raised where it is waited for
+            self.prepared.set_exception(exc)
+            return
+        self.prepared.set_result(None)
         while True:
             with self._changed:
                 while not self._queue and not self._is_closed:

@@ -5,12 +5,19 @@ its own simulator.
 """
 
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any  # Any: arguments of an adapter
 
 from vla_eval.checkpoints.execution_fields import ignored_fields
 from vla_eval.checkpoints.files import find_checkpoint, read_facts
-from vla_eval.checkpoints.notes import LEROBOT_ADAPTER, checkpoint_hashes, training_seeds, training_sentences
+from vla_eval.checkpoints.notes import (
+    COMPILE,
+    LEROBOT_ADAPTER,
+    checkpoint_hashes,
+    training_seeds,
+    training_sentences,
+)
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.policy import PolicyRecipe
@@ -18,6 +25,7 @@ from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import BatchPolicy, Policy
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.policies.compiled import Compilation, CompiledPolicy
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.registry import POLICIES, PRIVILEGED, make_from_adapter
@@ -49,6 +57,7 @@ class HostOptions:
         n_action_steps: for policies whose chunk has as many actions as are executed; None: the recipe's.
         max_batch: rows of a pass.
         device: what it runs on; None: as the recipe says.
+        compile: whether its network is compiled; False: as the recipe says.
     """
 
     policy: str
@@ -56,6 +65,7 @@ class HostOptions:
     n_action_steps: int | None = None
     max_batch: int = 16
     device: str | None = None
+    compile: bool = False
 
     def __post_init__(self) -> None:
         check_bounds(self, {"max_batch": (1, MAX_SERVER_ROWS), "n_action_steps": (1, MAX_STEPS)})
@@ -67,6 +77,7 @@ class HostedPolicy:
 
     Attributes:
         task: the task of an episode whose client names none.
+        env: what the policy was made for.
         ignored: what its checkpoint asks for that is not done here.
     """
 
@@ -74,7 +85,15 @@ class HostedPolicy:
     metadata: ServerMetadata
     reader: ObservationReader
     task: str
+    env: EnvSpec
     ignored: tuple[str, ...] = ()
+
+    def warm_up(self) -> Compilation | None:
+        """Compile the policy's network if that was asked for; for the sentences that it was trained with."""
+        if not isinstance(self.policy, CompiledPolicy):
+            return None
+        known = dict.fromkeys(chain.from_iterable((self.metadata.sentences or {}).values()))
+        return self.policy.warm_up(self.env, tuple(known))
 
     @property
     def n_rows(self) -> int:
@@ -110,6 +129,7 @@ def host_policy(options: HostOptions) -> HostedPolicy:
         metadata=_describe(policy, recipe, reader, env, hashes, options),
         reader=reader,
         task=env.task,
+        env=env,
         ignored=ignored_fields(recipe.value.adapter, recipe.value.args),
     )
 
@@ -134,6 +154,8 @@ def _make(recipe: Recipe[PolicyRecipe], options: HostOptions, env: EnvSpec) -> P
     args: dict[str, Any] = dict(recipe.value.args)
     if options.device is not None:
         args["device"] = options.device
+    if options.compile:
+        args[COMPILE] = True
     context = PolicyContext(
         name=recipe.name,
         env=env,
@@ -194,6 +216,7 @@ def _describe(
         versions={name: version for name, version in versions.items() if version is not None},
         training_seeds=training_seeds(recipe.value.adapter, recipe.value.args) or None,
         sentences=training_sentences(recipe.value.adapter, recipe.value.args),
+        other={COMPILE: True} if options.compile or recipe.value.args.get(COMPILE) else {},
     )
 
 

@@ -17,12 +17,14 @@ import sys
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 from websockets.asyncio.server import Server, ServerConnection, serve
 from websockets.datastructures import Headers
 from websockets.http11 import Request, Response
 
 from vla_eval.errors import VlaEvalError
+from vla_eval.policies.compiled import Compilation
 from vla_eval.serving.asked_sentences import AskedSentences
 from vla_eval.serving.batching import Batcher
 from vla_eval.serving.connection import ClientConnection, Service
@@ -85,15 +87,20 @@ class PolicyServer:
     """Serves one policy until it is stopped."""
 
     def __init__(
-        self, hosted: HostedPolicy, options: ServerOptions, metrics: ServerMetrics | None = None
+        self,
+        hosted: HostedPolicy,
+        options: ServerOptions,
+        metrics: ServerMetrics | None = None,
+        on_compiled: Callable[[Compilation], None] = lambda _: None,
     ) -> None:
-        self._hosted, self._options = hosted, options
+        self._hosted, self._options, self._on_compiled = hosted, options, on_compiled
         self._metrics = metrics or ServerMetrics()
         self._batcher = Batcher(
             hosted.policy,
             n_rows=hosted.n_rows,
             action_dims=hosted.metadata.action_dims or (),
             metrics=self._metrics,
+            prepare=self._warm_up,
         )
         self._sessions = SessionTable(
             hosted.reader,
@@ -112,15 +119,34 @@ class PolicyServer:
         self._numbers = itertools.count()
         self._is_stopping = False
 
+    def _warm_up(self) -> None:
+        compiled = self._hosted.warm_up()
+        if compiled is not None:
+            self._on_compiled(compiled)
+
+    async def _is_prepared(self, stop: asyncio.Event) -> bool:
+        """Wait until the policy can be asked; False: it was stopped meanwhile."""
+        prepared = asyncio.wrap_future(self._batcher.prepared)
+        stopped = asyncio.ensure_future(stop.wait())
+        waiting: set[asyncio.Future[Any]] = {prepared, stopped}
+        await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+        stopped.cancel()
+        if prepared.done():
+            prepared.result()  # raises what went wrong
+        return prepared.done()
+
     async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> bool:
         """Serve until `stop` is set; then finish the pass under way, and close all connections.
 
-        Calls `ready` once, with the port, when clients can connect. Returns whether the policy has answered;
+        Compiles the policy's network before, if that was asked for. Calls `ready` once, with the port, when
+        clients can connect. Returns whether the policy has answered;
         if not, its thread still runs.
 
         Raises:
             ServeError: the address cannot be listened on.
         """
+        if not await self._is_prepared(stop):
+            return False
         try:
             server = await serve(
                 self._serve_client,
@@ -210,12 +236,14 @@ def run_server(
     ready: Callable[[int], None],
     ends: Callable[[], None] | None = None,
     metrics: ServerMetrics | None = None,
+    on_compiled: Callable[[Compilation], None] = lambda _: None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; a second one ends the process at once.
 
     Within `END_SECONDS` of the first one the process has ended, whatever the policy does. `ready` is called
-    once, with the port, when clients can connect; `ends` in a thread of its own: when it returns, the server
-    stops as well. Errors are those of `PolicyServer.run`.
+    once, with the port, when clients can connect; `on_compiled` before, if a network was compiled. `ends` is
+    called in a thread of its own: when it returns, the server stops as well. Errors are those of
+    `PolicyServer.run`.
     """
 
     async def serve_until_stopped() -> bool:
@@ -239,7 +267,7 @@ def run_server(
                     loop.call_soon_threadsafe(stop.set)
 
             threading.Thread(target=watch, name="end of serving", daemon=True).start()
-        return await PolicyServer(hosted, options, metrics).run(stop, ready)
+        return await PolicyServer(hosted, options, metrics, on_compiled).run(stop, ready)
 
     has_ended = asyncio.run(serve_until_stopped())
     if not has_ended:  # Python would wait for its thread, or for threads that it has started

@@ -51,6 +51,7 @@ class ServerReady:
 
     port: int
     metadata: ServerMetadata
+    notes: tuple[str, ...]  # about its compiled network
 
 
 class SharedServers:
@@ -83,6 +84,11 @@ class SharedServers:
     def metadata(self) -> ServerMetadata:
         """Metadata of the servers."""
         return self._ready[0].metadata
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What the servers say of their compiled networks."""
+        return tuple(dict.fromkeys(note for ready in self._ready for note in ready.notes))
 
     @property
     def was_stopped(self) -> bool:
@@ -170,10 +176,14 @@ def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
         os.environ[VISIBLE_GPUS] = job.gpu  # before torch looks for GPUs
     try:
         hosted = host_policy(job.host)
+        notes: list[str] = []
         run_server(
             hosted,
             ServerOptions(host=job.address, port=0, api_key=job.api_key),
-            ready=lambda port: send_message(connection, ServerReady(port=port, metadata=hosted.metadata)),
+            ready=lambda port: send_message(
+                connection, ServerReady(port=port, metadata=hosted.metadata, notes=tuple(notes))
+            ),
+            on_compiled=lambda found: notes.append(found.note(job.host.policy)),
             ends=lambda: _wait_for_parent(connection),
             metrics=ServerMetrics(on_pass=functools.partial(add_count, shared)),
         )

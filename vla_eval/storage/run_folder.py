@@ -203,8 +203,8 @@ class RunFolder:
         """Record facts about the device; `RunChangedError` if known ones have changed."""
         self._keep(self._with_device(self._run_file, device))
 
-    def note_sentence(self, line: str) -> None:
-        """Record what a policy's tokenizer made of an instruction; tables quote it."""
+    def note(self, line: str) -> None:
+        """Record what tables quote: what a tokenizer made of an instruction, how a network was compiled."""
         if not any(line in session.sentences for session in self._run_file.sessions):
             self._keep(self._run_file.with_sentence(line))
 

@@ -4,6 +4,7 @@ The policy's own queues are not used, and the frames of an episode are kept here
 Types that collect their frames themselves are asked for one action per step (`checkpoints.select_step`).
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,10 +30,12 @@ from vla_eval.models.families import family_of
 from vla_eval.models.shared.earlier_frames import FrameMemory
 from vla_eval.models.shared.sentence_reading import SentenceReading
 from vla_eval.models.shared.tokens_read import Readings
+from vla_eval.policies.compiled import Compilation
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.lerobot.compiling import begin_pass, compile_network, warm_up
 from vla_eval.policies.lerobot.device import autocast, choose_device, cuda_devices
 from vla_eval.policies.lerobot.inputs import InputMap, InputOptions, check_training, input_map
-from vla_eval.specs import PolicySpec
+from vla_eval.specs import EnvSpec, PolicySpec
 
 
 class _Inferred(NamedTuple):
@@ -52,6 +55,7 @@ class LeRobotPolicy:
         batch: infer for all due slots in one forward pass; None: if there are several slots and the
             policy can. Sums are then made in another order, so that actions agree with those of a pass
             of its own only up to rounding.
+        is_compiled: whether its network compiles itself, see `compile_network`.
         n_slots: how many rows a pass has, due or not: with the same shape and the same place in it, an
             episode's actions are the same bits whatever the other rows are. Its place is `EpisodeStart.row`;
             its state is kept by its slot, and there may be more slots than rows.
@@ -64,6 +68,7 @@ class LeRobotPolicy:
         inputs: InputMap,
         *,
         batch: bool | None = False,
+        is_compiled: bool = False,
         n_slots: int = 1,
     ) -> None:
         self._loaded, self._inputs = loaded, inputs
@@ -93,7 +98,7 @@ class LeRobotPolicy:
             batch = n_slots > 1 and can_batch and (not self._remembers or remembers_in_rows(loaded.policy))
         # One episode that remembers is shown all its new frames at once, which is faster.
         self._batch = batch and (n_slots > 1 or not self._remembers)
-        self._n_slots = n_slots
+        self._n_slots, self._is_compiled = n_slots, is_compiled
         self._slots: dict[int, Episode] = {}
         self._readings = Readings()
         reads_more = self._remembers or self._by_step or self._earlier is not None or len(self._deltas) > 1
@@ -124,6 +129,14 @@ class LeRobotPolicy:
     def proprioception(self) -> StateKind | None:
         """Which proprioception it reads."""
         return self._inputs.state
+
+    def warm_up(self, env: EnvSpec, sentences: Sequence[str]) -> Compilation | None:
+        """Compile for these sentences, in the thread that will ask it; None: it is not to be compiled."""
+        if not self._is_compiled:
+            return None
+        precision = Counter(str(x.dtype).removeprefix("torch.") for x in self._loaded.policy.parameters())
+        ((most, _),) = precision.most_common(1)
+        return warm_up(self, env, sentences, n_rows=self._n_slots if self._batch else 1, precision=most)
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Infer for one episode."""
@@ -159,6 +172,8 @@ class LeRobotPolicy:
         heard = self._readings.of(row.start.instruction for row in rows)
         with torch.random.fork_rng(devices=devices), autocast(config), self._loaded.acting(), heard:
             torch.manual_seed(seeds[0])
+            if self._is_compiled:
+                begin_pass(config.device)
             policy.reset()  # whatever a policy keeps by itself would be shared by all slots
             extra: dict[str, Any] = {}
             if self._noise_shape is not None:
@@ -228,6 +243,7 @@ def make_lerobot(
     tokenizer: str | None = None,
     base_checkpoint: str | None = None,
     batch: bool | None = None,
+    compile: bool = False,
 ) -> LeRobotPolicy:
     """Make a policy from a LeRobot checkpoint; `docs/lerobot_policies.md` explains the arguments."""
     if checkpoint is None:
@@ -236,6 +252,8 @@ def make_lerobot(
         device=choose_device(device), dtype=dtype, tokenizer=tokenizer, base_checkpoint=base_checkpoint
     )
     loaded = load_checkpoint(Path(checkpoint), options)
+    if compile:
+        compile_network(loaded, policy=context.name)
     asked = InputOptions(
         cameras=CAMERA_KEYS if cameras is None else cameras, state=state, absent_cameras=absent_cameras
     )
@@ -245,4 +263,6 @@ def make_lerobot(
         refuse_differences(differences(facts, Asked(context.env)), policy=context.name, task=context.env.task)
         inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
         check_training(facts, inputs, loaded, context.env, policy=context.name)
-        return LeRobotPolicy(context.name, loaded, inputs, batch=batch, n_slots=context.n_slots)
+        return LeRobotPolicy(
+            context.name, loaded, inputs, batch=batch, is_compiled=compile, n_slots=context.n_slots
+        )

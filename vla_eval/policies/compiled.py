@@ -1,0 +1,42 @@
+"""What is known of a policy whose network was compiled. Imports no torch."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from vla_eval.specs import EnvSpec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compilation:
+    """What a warm-up found out.
+
+    Attributes:
+        seconds: it took, compilation included.
+        n_rows: of a pass.
+        precision: of most weights.
+        difference: the largest |compiled - not compiled| of an action, in the action's units.
+        scale: the largest |action|.
+    """
+
+    seconds: float
+    n_rows: int
+    precision: str
+    difference: float
+    scale: float
+
+    def note(self, policy: str) -> str:
+        """Return what tables say of it."""
+        return (
+            f"The network of {policy} was compiled ({self.precision}, {self.n_rows} in a pass): on random "
+            f"observations its actions, of at most {self.scale:.2g}, differ by at most {self.difference:.1g} "
+            "from those of the network as it is"
+        )
+
+
+@runtime_checkable
+class CompiledPolicy(Protocol):
+    """A policy whose network may be compiled."""
+
+    def warm_up(self, env: EnvSpec, sentences: Sequence[str]) -> Compilation | None:
+        """Compile for these sentences, in the thread that will ask it; None: it is not to be compiled."""
