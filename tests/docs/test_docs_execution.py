@@ -35,6 +35,7 @@ NOT_EXECUTED: Mapping[str, str] = {
     r"dataset mix data/many/.*": "ten tasks, some of which the fake simulator has not; two are mixed here",
     r"dataset (push|pull) .*": "the Hub; tests/data/test_hub.py",
     r"doctor --cluster .*|.* --cluster .*": "Ray; tests/evaluation/test_evaluate_on_cluster.py",
+    r"(eval|serve) .*compile.*": "a network without a memory; tests/policies/test_compiling.py",
     r"eval .*--json-progress .*": "an open file descriptor; tests/cli/test_json_progress.py",
     r"eval paper_vla_table --tiny .*": "minutes; tests/evaluation/test_tiny_model_table.py",
     r"eval .* remote_openpi@.*|eval .*ws://.* --set env.control_mode=.*|eval --task mikasa_vla/.*ws://.*": (
@@ -117,7 +118,7 @@ def _in_this_process() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vla_eval.cli.shared.cluster.LOCAL", IN_PROCESS)
         patch.setattr("vla_eval.cli.record.LOCAL", IN_PROCESS)
-        patch.setattr("vla_eval.serving.server.run_server", lambda *_, ready: ready(8000))
+        patch.setattr("vla_eval.serving.server.run_server", lambda *_, ready, **__: ready(8000))
         yield
 
 

@@ -51,6 +51,7 @@ class SessionsRow:
 
     n_sessions: int
     served: Load
+    compiled: Load | None  # the same with a compiled network; None: it was not asked for
     n_copies: int  # processes with a copy each; no more than there are cores
     copies: Load
 
@@ -78,6 +79,7 @@ class ServingReport:
     served: Percentiles  # the same behind a socket
     rows: tuple[SessionsRow, ...]
     rounding: tuple[Rounding, ...]
+    compilation: str  # the server's line about its compiled network; empty: it was not asked for
 
     @property
     def added(self) -> Percentiles:
@@ -85,8 +87,10 @@ class ServingReport:
         return Percentiles(self.served.p50 - self.direct.p50, self.served.p99 - self.direct.p99)
 
 
-def run_serving_bench(policy: str | None, *, sessions: Sequence[int], seconds: float) -> ServingReport:
-    """Measure each number of sessions, and each rate for these seconds.
+def run_serving_bench(
+    policy: str | None, *, sessions: Sequence[int], seconds: float, compiles: bool = False
+) -> ServingReport:
+    """Measure each number of sessions, and each rate for these seconds; `compiles`: also compiled.
 
     The policy is a recipe, its file or a checkpoint's folder; None: a small transformer with random weights.
     `RemotePolicyError`: a server or a copy does not start.
@@ -102,6 +106,7 @@ def run_serving_bench(policy: str | None, *, sessions: Sequence[int], seconds: f
             )
         load = os.getloadavg()[0]
         direct, behind, n_latencies = _latencies(still, seconds)
+        rows = [_row(served, n, seconds, compiles=compiles) for n in sessions]
         precisions: tuple[str | None, ...] = ("float32", "bfloat16") if policy is None else (None,)
         return ServingReport(
             policy=SMALL if policy is None else policy,
@@ -112,8 +117,9 @@ def run_serving_bench(policy: str | None, *, sessions: Sequence[int], seconds: f
             n_latencies=n_latencies,
             direct=direct,
             served=behind,
-            rows=tuple(_row(served, n, seconds) for n in sessions),
+            rows=tuple(row for row, _ in rows),
             rounding=tuple(_rounding(served, max(sessions), precision) for precision in precisions),
+            compilation=rows[-1][1],
         )
 
 
@@ -144,13 +150,21 @@ def _latencies(policy: str, seconds: float) -> tuple[Percentiles, Percentiles, i
     return direct, served, len(taken[0])
 
 
-def _row(policy: str, n_sessions: int, seconds: float) -> SessionsRow:
+def _row(policy: str, n_sessions: int, seconds: float, *, compiles: bool) -> tuple[SessionsRow, str]:
+    """Return the row, and the server's line about its compiled network."""
     free_before = free_device_bytes()
     with serving(policy, n_rows=n_sessions) as server:
         served = _served_rate(server, n_sessions, seconds, free_before)
+    compiled, said = None, ""
+    if compiles:
+        with serving(policy, n_rows=n_sessions, compiles=True) as server:
+            compiled, said = _served_rate(server, n_sessions, seconds, free_before), server.said
     n_copies = min(n_sessions, len(os.sched_getaffinity(0)))
     copies = measure_copies(policy, n_copies=n_copies, seconds=seconds)
-    return SessionsRow(n_sessions=n_sessions, served=served, n_copies=n_copies, copies=copies)
+    row = SessionsRow(
+        n_sessions=n_sessions, served=served, compiled=compiled, n_copies=n_copies, copies=copies
+    )
+    return row, said
 
 
 def _served_rate(server: Server, n_sessions: int, seconds: float, free_before: int | None) -> Load:

@@ -106,6 +106,7 @@ class Server:
 
     url: str
     pid: int
+    said: str  # before it was ready
 
     def connect(self) -> RemotePolicy:
         """Return the policy behind it, with one session on a connection of its own."""
@@ -113,21 +114,26 @@ class Server:
 
 
 @contextmanager
-def serving(policy: str, *, n_rows: int) -> Iterator[Server]:
+def serving(policy: str, *, n_rows: int, compiles: bool = False) -> Iterator[Server]:
     """Serve a policy on a free port, end the server afterwards; `RemotePolicyError` if it does not start."""
     command = python_command("-m", "vla_eval.cli", "serve", "--policy", policy)
-    command += ["--port", "0", "--max-batch", str(n_rows)]
+    command += ["--port", "0", "--max-batch", str(n_rows), *(["--compile"] if compiles else [])]
     with tempfile.TemporaryFile("w+") as errors:
         with own_need():
             process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors, text=True)
         try:
             assert process.stdout is not None  # it is a pipe
-            found = SERVING.search(process.stdout.readline())
+            said, found = "", None
+            for line in process.stdout:
+                found = SERVING.search(line)
+                if found:
+                    break
+                said += line
             if found is None:
                 process.wait(STOP_SECONDS)
                 errors.seek(0)
                 raise RemotePolicyError(f"bench: the server of '{policy}' ended: {errors.read()[-2000:]}")
-            yield Server(url=found.group(1), pid=process.pid)
+            yield Server(url=found.group(1), pid=process.pid, said=said.strip())
         finally:
             process.terminate()
             try:

@@ -3,10 +3,14 @@
 import argparse
 import shutil
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from vla_eval.cli.shared.arguments import NUMBERS, task_argument
 from vla_eval.errors import MissingDependencyError
 from vla_eval.strict.bounds import MAX_STEPS, check_bounds
+
+if TYPE_CHECKING:
+    from vla_eval.bench.serving_processes import Load
 
 SYNTHETIC = "synthetic"
 EAGER = ""  # the baseline of --against-official without an interpreter
@@ -71,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="POLICY",
         help="instead: a policy behind a socket against copies of it (a small transformer if none is named)",
     )
+    parser.add_argument("--compile", action="store_true", help="with --serve: also with a compiled network")
     parser.add_argument("--sessions", **NUMBERS, default=[1, 4, 8, 16], metavar="N", help="with --serve")
     parser.add_argument(
         "--seconds", type=float, default=10.0, help="of each rate, with --serve (default: %(default)s)"
@@ -212,7 +217,9 @@ def _official(args: argparse.Namespace) -> int:
 def _serving(args: argparse.Namespace) -> int:
     from vla_eval.bench.serving import run_serving_bench
 
-    report = run_serving_bench(args.serve or None, sessions=args.sessions, seconds=args.seconds)
+    report = run_serving_bench(
+        args.serve or None, sessions=args.sessions, seconds=args.seconds, compiles=args.compile
+    )
     n_parameters = report.n_parameters
     size = "" if n_parameters is None else f", {n_parameters / 1e6:.1f} M parameters"
     print(
@@ -225,14 +232,14 @@ def _serving(args: argparse.Namespace) -> int:
         f"(p99 {report.direct.p99:.2f} and {report.served.p99:.2f}): {report.added.p50:.2f} ms added "
         f"(p99 {report.added.p99:.2f})."
     )
-    print("| sessions | served/s | MiB | GPU MiB | copies | copies/s | MiB | GPU MiB |")
-    print("|--:|--:|--:|--:|--:|--:|--:|--:|")
+    more = " compiled/s | MiB | GPU MiB |" if args.compile else ""
+    print(f"| sessions | served/s | MiB | GPU MiB |{more} copies | copies/s | MiB | GPU MiB |")
+    print(f"|--:|--:|--:|--:|{'--:|' * more.count('|')}--:|--:|--:|--:|")
     for row in report.rows:
-        served, copies = (
-            f"{load.per_second:.1f} | {load.resident_bytes / MIB:.0f} | {_mib(load.device_bytes)}"
-            for load in (row.served, row.copies)
-        )
-        print(f"| {row.n_sessions} | {served} | {row.n_copies} | {copies} |")
+        served, compiled, copies = map(_load, (row.served, row.compiled, row.copies))
+        print(f"| {row.n_sessions} {served} {compiled}| {row.n_copies} {copies} |")
+    if report.compilation:
+        print(report.compilation)
     print("Copies are processes with one thread each, no more than there are cores.")
     for one in report.rounding:
         print(
@@ -240,6 +247,12 @@ def _serving(args: argparse.Namespace) -> int:
             f"by at most {one.largest:.2g}; the largest action is {one.scale:.2g}."
         )
     return 0
+
+
+def _load(load: "Load | None") -> str:
+    if load is None:
+        return ""
+    return f"| {load.per_second:.1f} | {load.resident_bytes / MIB:.0f} | {_mib(load.device_bytes)}"
 
 
 def _mib(n_bytes: int | None) -> str:

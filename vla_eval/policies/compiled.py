@@ -1,4 +1,4 @@
-"""What is known of a policy whose network was compiled. Imports no torch."""
+"""What a warm-up of a compiled network finds out. Imports no torch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ class Compilation:
     scale: float
 
     def note(self, policy: str) -> str:
-        """Return what tables say of it."""
+        """Return the line that tables print."""
         return (
             f"The network of {policy} was compiled ({self.precision}, {self.n_rows} in a pass): on random "
             f"observations its actions, of at most {self.scale:.2g}, differ by at most {self.difference:.1g} "

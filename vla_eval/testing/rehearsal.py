@@ -12,12 +12,9 @@ from pathlib import Path
 from typing import Any  # lerobot is untyped
 
 import torch
-from torch import Tensor
 
 from vla_eval.checkpoints.files import ADAPTER_CONFIG_FILE, WEIGHTS_FILE, find_checkpoint
-from vla_eval.checkpoints.loading import LoadOptions, load_checkpoint, make_unfilled_policy, read_config
-from vla_eval.checkpoints.policy_types import history
-from vla_eval.checkpoints.verify import random_batch
+from vla_eval.checkpoints.loading import LoadOptions, make_unfilled_policy, read_config
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
@@ -25,10 +22,10 @@ from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow, Policy
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import CheckpointError
 from vla_eval.features import CAMERA_KEYS
-from vla_eval.models.episodes.memory import remembers_in_rows
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
+from vla_eval.testing.inference_rates import inference_rates
 from vla_eval.testing.process_memory import (
     peak_device_bytes,
     peak_rss_bytes,
@@ -153,7 +150,7 @@ def _measured(one: _Loading, before: int, estimated: Estimated, batches: Sequenc
         peak_rss_bytes=one.peaks,
         peak_device_bytes=on_device,
         seconds=one.seconds,
-        inferences_per_second=_rates(one.folder, device, batches) if batches else {},
+        inferences=inference_rates(one.folder, device, batches) if batches else {},
         before_bytes=before,
         limit_bytes=limit,
         estimated=estimated,
@@ -231,20 +228,3 @@ def _load_and_act(one: _Loading) -> Any:
     one.peaks["act"] = peak_rss_bytes()
     one.seconds |= {"first_inference": timed.seconds[0], "second_inference": timed.seconds[1]}
     return loaded._loaded.policy
-
-
-@torch.no_grad()
-def _rates(folder: Path, device: str, batches: Sequence[int]) -> dict[int, float]:
-    """Return inferences per second by the number of episodes in one forward pass."""
-    loaded = load_checkpoint(folder, LoadOptions(device=device))
-    one = random_batch(loaded.config, history(loaded.config), torch.Generator().manual_seed(0))
-    rates: dict[int, float] = {}
-    for n in batches:
-        batch = {key: x.repeat_interleave(n, 0) if isinstance(x, Tensor) else x * n for key, x in one.items()}
-        for _ in range(2):  # the first one fills caches
-            started = time.perf_counter()
-            extra = {"memory": loaded.policy.begin_memory(n)} if remembers_in_rows(loaded.policy) else {}
-            chunk = loaded.policy.predict_action_chunk(loaded.preprocessor(dict(batch)), **extra)
-            loaded.postprocessor(chunk)  # on the CPU at its end, so that the device has finished
-            rates[n] = n / (time.perf_counter() - started)
-    return rates

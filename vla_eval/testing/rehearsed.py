@@ -33,7 +33,7 @@ class Rehearsed:
     peak_rss_bytes: Mapping[str, int]
     peak_device_bytes: int | None
     seconds: Mapping[str, float]
-    inferences_per_second: Mapping[int, float]
+    inferences: Mapping[int, Any]  # by episodes in a pass, see `InferenceRate`
     before_bytes: int  # memory of the process before anything was made: torch, transformers, lerobot
     limit_bytes: int  # 1.15 × the weights + 2 GB, which loading and acting must keep
     estimated: Estimated

@@ -13,10 +13,13 @@ from typing import Any  # lerobot is untyped
 
 import numpy as np
 import torch
+from torch._functorch import config as functorch_config
+from torch._inductor.cpu_vec_isa import pick_vec_isa
 
 from vla_eval.checkpoints.policy_types import cannot_compile, check_compiled
 from vla_eval.core import EpisodeStart, FloatArray, Observation, ObservationWindow, Policy
 from vla_eval.errors import SpecMismatchError
+from vla_eval.lock.switch import own_need
 from vla_eval.models.episodes.memory import remembers
 from vla_eval.models.families import family_of
 from vla_eval.policies.compiled import Compilation
@@ -26,6 +29,14 @@ from vla_eval.wire.noise import noise_image, noise_state
 
 MAX_SHAPES = 64
 """How many shapes of inputs a network is compiled for: some policies pad sentences to the longest one."""
+OPTIONS = {
+    "deterministic": True,  # no kernel is chosen by its time
+    "fallback_random": True,  # torch's own draws
+    # The two start programs that the lock refuses (docs/security.md): `openssl`, and Python for a pool.
+    "cpp_cache_precompile_headers": False,
+    "compile_threads": 1,
+    "fx_graph_cache": False,  # files that are unpickled
+}
 SENTENCE = "pick the cube"  # of a warm-up, where none is known
 SLOT = 0
 
@@ -36,9 +47,11 @@ def compile_network(loaded: Any, *, policy: str) -> None:
     check_compiled(config.type, policy=policy)
     if remembers(network):
         raise cannot_compile(config.type, "it has a memory", policy=policy)
-    options: dict[str, Any] = {"deterministic": True, "fallback_random": True}
+    options: dict[str, Any] = {**OPTIONS}
     if cuda_devices(config.device):
         options["triton.cudagraphs"] = True
+    with own_need():  # it tries in a process of its own which vectors the processor knows, and keeps that
+        pick_vec_isa()
     for path in family_of(config.type).compiled:
         *parents, name = path.split(".")
         owner = functools.reduce(getattr, parents, network)
@@ -59,7 +72,8 @@ def _guarded(compiled: Callable[..., Any], policy: str) -> Callable[..., Any]:
 
     def run(*args: Any, **kwargs: Any) -> Any:
         try:
-            with torch._dynamo.config.patch(**changes):
+            no_pickles = functorch_config.patch(enable_autograd_cache=False)
+            with torch._dynamo.config.patch(**changes), no_pickles:
                 return compiled(*args, **kwargs)
         except torch._dynamo.exc.FailOnRecompileLimitHit as exc:
             raise SpecMismatchError(
