@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--policy",
         nargs="+",
-        default=["act", "memory", "recurrent", "pi0"],
+        default=["act", "memory", "recurrent"],
         metavar="P",
         help="with --loader: recipes whose batches are loaded (default: %(default)s)",
     )

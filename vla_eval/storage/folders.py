@@ -86,6 +86,8 @@ def what_is(path: Path) -> str:
     """Return a sentence for a message: what a folder is, or what lies below it; empty if that is nothing."""
     if kind := kind_of(path):
         return f" It is a {kind}."
+    if not os.path.isdir(path):  # also a name that no folder can have
+        return ""
     for depth in range(1, _DEEPEST + 1):
         places = sorted(islice(path.glob("*/" * depth), _MOST))
         found = {place: kind for place in places if (kind := kind_of(place)) not in (None, RECORDING)}
