@@ -54,7 +54,10 @@ class EpisodeLog:
         self.n_steps += 1
         self._check_finite(result)
         self.status = result.status
-        self._note_reach(result)
+        position_m = _tcp_m(result)
+        if position_m is not None and self.tcp_start_m is not None:
+            distance_m = float(np.linalg.norm(position_m - self.tcp_start_m))
+            self.tcp_reach_m = max(self.tcp_reach_m or 0.0, distance_m)
         self.episode_return += result.reward
         bounds = zip(action.tolist(), action_spec.low, action_spec.high, strict=True)
         self.n_clipped_steps += not all(low <= number <= high for number, low, high in bounds)
@@ -108,12 +111,6 @@ class EpisodeLog:
             candidate_places=status.candidate_places or None,
             final_turn_rad=status.turned_rad,
         )
-
-    def _note_reach(self, result: StepResult) -> None:
-        position_m = _tcp_m(result)
-        if position_m is not None and self.tcp_start_m is not None:
-            distance_m = float(np.linalg.norm(position_m - self.tcp_start_m))
-            self.tcp_reach_m = max(self.tcp_reach_m or 0.0, distance_m)
 
     def _check_finite(self, result: StepResult) -> None:
         values = {"reward": np.array(result.reward), **result.observation.state}

@@ -48,18 +48,14 @@ def replace(doors: tuple[Door, ...]) -> None:
             setattr(owner, name, guarded[id(original)])
         _replaced.add((door.module, door.name))
     if guarded:
-        _replace_imported(guarded)
-
-
-def _replace_imported(guarded: dict[int, Any]) -> None:
-    """Replace what was imported by `from … import`, under whatever name. A later import gets the guard."""
-    for module in list(sys.modules.values()):
-        names = getattr(module, "__dict__", None)
-        if not isinstance(names, dict):
-            continue
-        found = [name for name, value in list(names.items()) if id(value) in guarded]
-        for name in found:
-            names[name] = guarded[id(names[name])]
+        # What was imported by `from … import`, under whatever name. A later import gets the guard.
+        for module in list(sys.modules.values()):
+            names = getattr(module, "__dict__", None)
+            if not isinstance(names, dict):
+                continue
+            found = [name for name, value in list(names.items()) if id(value) in guarded]
+            for name in found:
+                names[name] = guarded[id(names[name])]
 
 
 def _guarded(original: Any, guard: Guard) -> Any:

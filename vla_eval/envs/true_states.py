@@ -56,8 +56,9 @@ class TrueStates:
         self._evaluated = None
         return super().reset(*args, **kwargs)  # type: ignore[misc]
 
-    def _keep_parked(self) -> None:
-        """Hold what is parked where it was parked first."""
+    def _step_action(self, action: Any) -> Any:
+        self.put_back()
+        # What is parked stays where it was parked first.
         parked = {}
         actors: Any = self.scene.actors.values()  # type: ignore[attr-defined]
         for body in (body for one in actors if one.px_body_type == "dynamic" for body in one._bodies):
@@ -67,10 +68,6 @@ class TrueStates:
                 body.entity.pose = parked[key]
                 body.linear_velocity = body.angular_velocity = np.zeros(3)
         self._parked_poses = parked
-
-    def _step_action(self, action: Any) -> Any:
-        self.put_back()
-        self._keep_parked()
         return super()._step_action(action)  # type: ignore[misc]
 
 

@@ -48,7 +48,13 @@ def load_policy_entries(texts: Sequence[str]) -> tuple[PolicyEntry, ...]:
 def load_policy_entry(text: str) -> PolicyEntry:
     """Return the policy that an entry of a configuration names, with all its checkpoints."""
     named = named_checkpoints(text)
-    _refuse_empty(text)
+    # `NAME=` and `NAME=A,,B`, as of a shell variable that is not set.
+    name, equals, folders = text.partition("=")
+    if equals and not all(folders.split(",")) and not os.path.exists(text):
+        raise RecipeError(
+            f"policies: {text}: expected a folder with a checkpoint after '{name}=', found empty text. "
+            f"{NOT_SET}"
+        )
     if named is None:
         return _single(text)
     for one in named.checkpoints:
@@ -82,16 +88,6 @@ def _single(text: str) -> PolicyEntry:
     is_remote = recipe.value.adapter == REMOTE_ADAPTER
     said = survey(recipe.value.args, policy=recipe.name) if is_remote else None
     return PolicyEntry(name=recipe.name, recipes=(recipe,), texts=(text,), server=said)
-
-
-def _refuse_empty(text: str) -> None:
-    """Raise `RecipeError` for `NAME=` and `NAME=A,,B`, as of a shell variable that is not set."""
-    name, equals, folders = text.partition("=")
-    if equals and not all(folders.split(",")) and not os.path.exists(text):
-        raise RecipeError(
-            f"policies: {text}: expected a folder with a checkpoint after '{name}=', found empty text. "
-            f"{NOT_SET}"
-        )
 
 
 def _is_served(text: str, one: str) -> RecipeError:

@@ -41,7 +41,12 @@ def render(
     if preset is not None:
         return paper_preset(table)
     if fmt == "csv":
-        return _csv(table, sides)
+        names = list(table.rows[0].to_dict()) if table.rows else column_names()
+        source = ["source"] if sides else []  # a column, so that they are never confused
+        added = dict.fromkeys(name for side in sides for name in side.csv_columns)
+        columns = [*source, *names, *(name for name in added if name not in names)]
+        measured = ({"source": "measured", **row.to_dict()} for row in table.rows)
+        return csv_text(columns, [*measured, *(line for side in sides for line in side.csv_rows)])
     if fmt == "json":
         return _json(table, sides)
     return write_tables([lay_out(table, names=columns, wide=wide, width=width), *sides], fmt)
@@ -74,15 +79,6 @@ def side_tables(table: Table, *, paper: bool = False, published: str | None = No
         *([paper_side_table(table)] if paper else []),
         *(published_side_tables(published) if published is not None else []),
     ]
-
-
-def _csv(table: Table, sides: Sequence[SideTable]) -> str:
-    names = list(table.rows[0].to_dict()) if table.rows else column_names()
-    source = ["source"] if sides else []  # a column, so that they are never confused
-    added = dict.fromkeys(name for side in sides for name in side.csv_columns)
-    columns = [*source, *names, *(name for name in added if name not in names)]
-    measured = ({"source": "measured", **row.to_dict()} for row in table.rows)
-    return csv_text(columns, [*measured, *(line for side in sides for line in side.csv_rows)])
 
 
 def _json(table: Table, sides: Sequence[SideTable]) -> str:

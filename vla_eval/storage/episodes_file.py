@@ -20,7 +20,14 @@ def parse_records(data: bytes, path: Path, planned: PlannedEpisodes) -> dict[Epi
     records: dict[EpisodeKey, EpisodeRecord] = {}
     strangers: list[str] = []
     for line, where in whole_lines(data, path):
-        record = _parse_record(line, where)
+        try:
+            text = line.decode("utf-8")
+        except UnicodeDecodeError as exc:
+            raise RunFolderError(
+                f"{where}: expected an episode record in UTF-8, found {line[:80]!r}. The file was changed by "
+                f"something else; restore it or start a new run folder."
+            ) from exc
+        record = EpisodeRecord.from_json(text, where=where)
         objection = planned.objection(record)
         if objection is not None:
             strangers.append(f"  line {where.rpartition(':')[2]}: {shown_key(record.key)}: {objection}")
@@ -45,17 +52,6 @@ def _not_planned(strangers: list[str], path: Path) -> RunFolderError:
         f"{len(strangers)} that it does not:\n{listed}\nThey are from another run, or a file was changed: "
         f"move these lines to the folder of their own run, or start a new run folder."
     )
-
-
-def _parse_record(line: bytes, where: str) -> EpisodeRecord:
-    try:
-        text = line.decode("utf-8")
-    except UnicodeDecodeError as exc:
-        raise RunFolderError(
-            f"{where}: expected an episode record in UTF-8, found {line[:80]!r}. The file was changed by "
-            f"something else; restore it or start a new run folder."
-        ) from exc
-    return EpisodeRecord.from_json(text, where=where)
 
 
 def repair_records(path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, EpisodeRecord]:

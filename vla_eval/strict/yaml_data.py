@@ -108,7 +108,17 @@ class _Reader:
 
     def _content(self, event: _Event, depth: int) -> Any:  # Any: plain data
         if isinstance(event, yaml.ScalarEvent):
-            return self._scalar(event)
+            text: str = event.value
+            self._n_characters += len(text)
+            if Reader.NON_PRINTABLE.search(text):
+                self._refuse("found a control character or half a character, expected text", event)
+            if event.style is not None:  # in quotes, or a block
+                return text
+            if text in _WORDS:
+                return _WORDS[text]
+            if _WHOLE.fullmatch(text):
+                return self._whole_number(event, text.replace("_", ""))
+            return _number(text) if _NUMBER.fullmatch(text) else text
         if isinstance(event, yaml.SequenceStartEvent):
             items = []
             while not isinstance(event := self._next(), yaml.SequenceEndEvent):
@@ -130,19 +140,6 @@ class _Reader:
         if not isinstance(name, str):
             self._refuse(f"found the key {name!r}, expected text (write it in quotes)", event)
         return name
-
-    def _scalar(self, event: _Event) -> str | int | float | None:
-        text: str = event.value
-        self._n_characters += len(text)
-        if Reader.NON_PRINTABLE.search(text):
-            self._refuse("found a control character or half a character, expected text", event)
-        if event.style is not None:  # in quotes, or a block
-            return text
-        if text in _WORDS:
-            return _WORDS[text]
-        if _WHOLE.fullmatch(text):
-            return self._whole_number(event, text.replace("_", ""))
-        return _number(text) if _NUMBER.fullmatch(text) else text
 
     def _whole_number(self, event: _Event, text: str) -> int:
         n_digits = len(text.lstrip("+-"))

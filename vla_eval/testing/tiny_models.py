@@ -149,7 +149,14 @@ def _tokenizer(named: Mapping[str, str], *, n_tokens: int | None = None) -> Any:
     )
     tokenizer.train_from_iterator(CORPUS, trainer)
     if n_tokens is not None:
-        tokenizer.model = _with_more_tokens(tokenizer, n_tokens)
+        # `add_tokens` takes minutes for 250,000.
+        from tokenizers import models
+
+        model = json.loads(tokenizer.to_str())["model"]
+        vocabulary = model["vocab"] | {f"<{index}>": index for index in range(len(model["vocab"]), n_tokens)}
+        merges = [tuple(pair) for pair in model["merges"]]
+        make_model: Any = models.BPE
+        tokenizer.model = make_model(vocab=vocabulary, merges=merges, unk_token=model["unk_token"])
     make_fast: Any = PreTrainedTokenizerFast
     extra = {"extra_special_tokens": dict(named)} if named else {}
     return make_fast(
@@ -161,17 +168,6 @@ def _tokenizer(named: Mapping[str, str], *, n_tokens: int | None = None) -> Any:
         padding_side="right",
         **extra,
     )
-
-
-def _with_more_tokens(tokenizer: Any, n_tokens: int) -> Any:
-    """Return a tokenizer's model of that many tokens; `add_tokens` takes minutes for 250,000."""
-    from tokenizers import models
-
-    model = json.loads(tokenizer.to_str())["model"]
-    vocabulary = model["vocab"] | {f"<{index}>": index for index in range(len(model["vocab"]), n_tokens)}
-    merges = [tuple(pair) for pair in model["merges"]]
-    make_model: Any = models.BPE
-    return make_model(vocab=vocabulary, merges=merges, unk_token=model["unk_token"])
 
 
 def make_tiny(context: PolicyContext, *, checkpoint: str, **args: Any) -> LeRobotPolicy:

@@ -80,8 +80,22 @@ def fit_to_dataset(config: Any, recipe: FinetuneRecipe, dataset: OpenDataset) ->
         if hasattr(config, "fit_to_control_mode"):
             config.fit_to_control_mode(dataset.facts.control_mode)
         if hasattr(config, "window_steps"):
-            _set_window(config, dataset)
-        _check_features(config, dataset)
+            # The history of a policy with a memory reaches back to the beginning of every episode.
+            longest = max(dataset.lengths)
+            if config.window_steps is None:
+                config.window_steps = longest
+            if config.window_steps < longest:
+                raise SpecMismatchError(
+                    f"finetune.policy.window_steps is {config.window_steps}; expected at least the length of "
+                    f"the longest episode of {dataset.name}, {longest} frames: a memory must begin where the "
+                    f"episode does. Leave the field out."
+                )
+        try:
+            copy.deepcopy(config).validate_features()  # a copy: some policies add fields to themselves
+        except VlaEvalError:
+            raise  # ours say what to do
+        except Exception as exc:  # the policies raise what they like
+            raise SpecMismatchError(f"{dataset.root} does not fit the policy: {exc}") from exc
         if hasattr(config, "fit_to_actions"):
             actions = torch.from_numpy(dataset.columns_used[ACTION_KEY].astype(np.float32))
             statistics = usable_statistics(dataset.meta.stats, dataset.meta.features)
@@ -104,28 +118,6 @@ def image_transforms(recipe: FinetuneRecipe) -> ImageTransformsConfig:
     except Exception as exc:  # draccus, lerobot and torchvision raise what they like
         raise RecipeError(f"finetune.image_transforms: {exc}") from exc
     return config
-
-
-def _check_features(config: Any, dataset: OpenDataset) -> None:
-    try:
-        copy.deepcopy(config).validate_features()  # a copy: some policies add fields to themselves
-    except VlaEvalError:
-        raise  # ours say what to do
-    except Exception as exc:  # the policies raise what they like
-        raise SpecMismatchError(f"{dataset.root} does not fit the policy: {exc}") from exc
-
-
-def _set_window(config: Any, dataset: OpenDataset) -> None:
-    """Let the history of a policy with a memory reach back to the beginning of every episode."""
-    longest = max(dataset.lengths)
-    if config.window_steps is None:
-        config.window_steps = longest
-    if config.window_steps < longest:
-        raise SpecMismatchError(
-            f"finetune.policy.window_steps is {config.window_steps}; expected at least the length of the "
-            f"longest episode of {dataset.name}, {longest} frames: a memory must begin where the episode "
-            f"does. Leave the field out."
-        )
 
 
 def masks_padding(config: Any) -> bool:

@@ -47,7 +47,15 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvS
         for taped in tape.steps:
             set_step(stream, taped.step, env.control_hz)
             _log_step(stream, taped, env.action.dims)
-        _log_chunks(stream, tape, env, n_series)
+        # Each chunk at the steps that it was meant for: the executed part, and what was never executed.
+        for index in range(n_series):
+            own = tape.chunks[index::n_series]
+            if not own:
+                continue
+            steps = np.concatenate([np.arange(len(one.chunk.actions)) + one.step for one in own])
+            values = np.concatenate([one.chunk.actions for one in own])
+            for dim, name in enumerate(env.action.dims):
+                send_curve(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], env.control_hz)
         _log_events(stream, tape, record, env.control_hz)
 
 
@@ -143,18 +151,6 @@ def n_overlapping(tape: EpisodeTape) -> int:
     gaps = [later - earlier for earlier, later in pairwise(starts)]
     longest = max((len(one.chunk.actions) for one in tape.chunks), default=1)
     return -(-longest // max(min(gaps, default=longest), 1))
-
-
-def _log_chunks(stream: rr.RecordingStream, tape: EpisodeTape, env: EnvSpec, n_series: int) -> None:
-    """Log each chunk at the steps that it was meant for: the executed part, and what was never executed."""
-    for index in range(n_series):
-        own = tape.chunks[index::n_series]
-        if not own:
-            continue
-        steps = np.concatenate([np.arange(len(one.chunk.actions)) + one.step for one in own])
-        values = np.concatenate([one.chunk.actions for one in own])
-        for dim, name in enumerate(env.action.dims):
-            send_curve(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], env.control_hz)
 
 
 def _log_events(

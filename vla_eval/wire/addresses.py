@@ -31,7 +31,17 @@ def split_urls(text: str) -> tuple[str, ...]:
     """Return the addresses of a list with commas; a `RecipeError` for one that is wrong or there twice."""
     urls = tuple(url.strip().rstrip("/") for url in text.split(","))
     for url in urls:
-        _check_url(url)
+        try:
+            parts = urlsplit(url)
+            is_address = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
+            has_user = parts.username is not None
+        except ValueError:  # a port that is not a number, or brackets that do not close
+            is_address = has_user = False
+        if not is_address or has_user or not url.isprintable() or " " in url:
+            raise RecipeError(
+                f"'{url:.{MAX_SHOWN}}' is not the address of a policy server: expected ws://HOST:PORT or "
+                f"wss://HOST:PORT, several with commas between them."
+            )
         if urls.count(url) > 1:
             raise RecipeError(f"the server '{url:.{MAX_SHOWN}}' is named twice.")
     return urls
@@ -48,17 +58,3 @@ def is_loopback(url: str) -> bool:
     """Whether the server is on this machine."""
     host = urlsplit(url).hostname or ""
     return host in LOOPBACK or host.startswith("127.")
-
-
-def _check_url(url: str) -> None:
-    try:
-        parts = urlsplit(url)
-        is_address = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
-        has_user = parts.username is not None
-    except ValueError:  # a port that is not a number, or brackets that do not close
-        is_address = has_user = False
-    if not is_address or has_user or not url.isprintable() or " " in url:
-        raise RecipeError(
-            f"'{url:.{MAX_SHOWN}}' is not the address of a policy server: expected ws://HOST:PORT or "
-            f"wss://HOST:PORT, several with commas between them."
-        )

@@ -191,19 +191,15 @@ def _read_array(fields: dict[str, Any]) -> np.ndarray[Any, Any]:
             f"an array: expected {math.prod(shape) * dtype.itemsize} bytes for the shape {shape!r:.80} of "
             f"{dtype.str}, found {len(data)}"
         )
-    _check_content(data, dtype)
-    array = np.frombuffer(data, dtype=dtype) if data else np.empty(0, dtype=dtype)
-    return array.reshape(shape).astype(dtype.newbyteorder("="))  # `astype` copies
-
-
-def _check_content(data: bytes, dtype: np.dtype[Any]) -> None:
-    """Refuse bytes that no value of this type has, which numpy would not notice."""
+    # Bytes that no value of this type has, which numpy would not notice.
     if dtype.kind == "b" and data and np.frombuffer(data, dtype=np.uint8).max() > 1:
         raise CodecError("an array: expected 0 or 1 for a bool")
     if dtype.kind == "U" and data:
         code_points = np.frombuffer(data, dtype=np.dtype(np.uint32).newbyteorder(dtype.byteorder))
         if code_points.max() > _MAX_CODE_POINT:
             raise CodecError("an array: expected text, found a number that is not a character")
+    array = np.frombuffer(data, dtype=dtype) if data else np.empty(0, dtype=dtype)
+    return array.reshape(shape).astype(dtype.newbyteorder("="))  # `astype` copies
 
 
 def _read_scalar(fields: dict[str, Any]) -> Any:

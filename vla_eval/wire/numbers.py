@@ -33,11 +33,6 @@ def as_state(value: Any, names: Sequence[str]) -> np.ndarray[Any, Any]:
     for name, given, held in zip(names, value.tolist(), state.tolist()):
         if not np.isfinite(held):
             raise NumbersError(f"expected finite numbers of float32, found {given} for '{name}'")
-    _check_rotations(state, names)
-    return state
-
-
-def _check_rotations(state: np.ndarray[Any, Any], names: Sequence[str]) -> None:
     for group, places in unit_vectors(names):
         vector = state[places].astype(np.float64)
         length = float(np.linalg.norm(vector))
@@ -47,6 +42,7 @@ def _check_rotations(state: np.ndarray[Any, Any], names: Sequence[str]) -> None:
                 f"expected {what}, of length 1, in {', '.join(group)}; found {vector.tolist()}, of length "
                 f"{length:.3g}"
             )
+    return state
 
 
 def unit_vectors(names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], list[int]]]:

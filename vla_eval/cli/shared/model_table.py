@@ -100,7 +100,14 @@ def evaluate_table(args: argparse.Namespace) -> int:
             stopped = _finetune(study, backend, device="cpu")
             if stopped is not None:
                 return stopped
-        _refuse_unfinished(study, args)
+        missing = unfinished(study)
+        if missing:
+            names = [one.name for one in missing[:3]]
+            more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
+            raise RecipeError(
+                f"{study.table.name}: not fine-tuned to the end yet: {'; '.join(names)}{more}. "
+                f"First: mikasa-vla finetune {args.config}{_part(args)} --out {study.out}"
+            )
         return _evaluate(study, backend, args)
 
 
@@ -152,17 +159,6 @@ def _finetune(study: Study, backend: Backend, *, device: str, allow_unreplayed: 
             is_stopping=lambda: stop.is_asked,
         )
     return None if is_finished else stop.exit_code
-
-
-def _refuse_unfinished(study: Study, args: argparse.Namespace) -> None:
-    missing = unfinished(study)
-    if missing:
-        names = [one.name for one in missing[:3]]
-        more = f" and {len(missing) - 3} more" if len(missing) > 3 else ""
-        raise RecipeError(
-            f"{study.table.name}: not fine-tuned to the end yet: {'; '.join(names)}{more}. "
-            f"First: mikasa-vla finetune {args.config}{_part(args)} --out {study.out}"
-        )
 
 
 def _part(args: argparse.Namespace) -> str:

@@ -63,7 +63,13 @@ class _Output(_Stream):
 @contextlib.contextmanager
 def standard_streams() -> Iterator[None]:
     """Make standard output and error safe to write to; restore them afterwards."""
-    _fill_descriptors()
+    # Open what the shell has closed (`2>&-`): else the next file, perhaps of results, takes its number.
+    for descriptor in range(STDERR_FD + 1):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            # The lowest free number is given, which is this one. Standard output is to be unwritable still.
+            os.open(os.devnull, os.O_RDONLY if descriptor == STDOUT_FD else os.O_RDWR)
     before = (sys.stdout, sys.stderr)
     # A closed stream is None, and `print(file=None)` would write to the other one.
     out = sys.stdout or os.fdopen(STDOUT_FD, "w", encoding="utf-8", closefd=False)
@@ -85,16 +91,6 @@ def _print_traceback(kind: type[BaseException], exc: BaseException, trace: Trace
     """Print a traceback as Python does, without the control characters of its message."""
     if sys.stderr is not None:
         PlainStream(sys.stderr).writelines(traceback.format_exception(kind, exc, trace))
-
-
-def _fill_descriptors() -> None:
-    """Open what the shell has closed (`2>&-`): else the next file, perhaps of results, takes its number."""
-    for descriptor in range(STDERR_FD + 1):
-        try:
-            os.fstat(descriptor)
-        except OSError:
-            # The lowest free number is given, which is this one. Standard output is to be unwritable still.
-            os.open(os.devnull, os.O_RDONLY if descriptor == STDOUT_FD else os.O_RDWR)
 
 
 def _escape(stream: TextIO) -> str | None:

@@ -108,7 +108,13 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
             key: column[index].clone() if isinstance(column, torch.Tensor) else column[index]
             for key, column in self._columns.items()
         }
-        rows, padding = self._queries(index)
+        # Field -> rows, those beyond the episode replaced by its ends, and which ones were.
+        first, stop = self._bounds[index].tolist()
+        rows, padding = {}, {}
+        for key, deltas in (self._deltas or {}).items():
+            wanted = [index + delta for delta in deltas]
+            rows[key] = [max(first, min(stop - 1, row)) for row in wanted]
+            padding[f"{key}_is_pad"] = torch.tensor([not first <= row < stop for row in wanted])
         fields |= padding
         for key, chosen in rows.items():
             if key not in self._frames:
@@ -139,16 +145,6 @@ class DecodedFramesDataset(torch.utils.data.Dataset[Sample]):
                     f"{path.parent}: it is made again."
                 )
             self._frames[camera] = frames
-
-    def _queries(self, index: int) -> tuple[dict[str, list[int]], dict[str, torch.Tensor]]:
-        """Return field -> rows, those beyond the episode replaced by its ends, and which ones were."""
-        first, stop = self._bounds[index].tolist()
-        rows, padding = {}, {}
-        for key, deltas in (self._deltas or {}).items():
-            wanted = [index + delta for delta in deltas]
-            rows[key] = [max(first, min(stop - 1, row)) for row in wanted]
-            padding[f"{key}_is_pad"] = torch.tensor([not first <= row < stop for row in wanted])
-        return rows, padding
 
     def _images(self, index: int, rows: Mapping[str, list[int]]) -> Sample:
         """Return the images of a sample by field; `rows` has those of fields with an axis of time."""

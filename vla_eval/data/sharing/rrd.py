@@ -82,7 +82,11 @@ def _write(dataset: Any, number: int, recorded: RecordedEpisode | None, path: Pa
         _log_facts(stream, dataset, number, frames, recorded)
         _log_numbers(stream, dataset, frames)
         _log_arm(stream, dataset, frames)
-        _log_pictures(stream, dataset, frames)
+        for step, frame in enumerate(frames):
+            set_step(stream, step, float(dataset.fps))
+            for key in dataset.meta.camera_keys:
+                picture = in_bytes(frame[key]).permute(1, 2, 0).numpy()
+                stream.log(f"cameras/{_camera(key)}", rr.Image(picture).compress(jpeg_quality=JPEG_QUALITY))
         if recorded is not None:
             _log_phases(stream, recorded, float(dataset.fps))
     return path
@@ -155,14 +159,6 @@ def _log_arm(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapping[
     for step, numbers in enumerate(_column(frames, key)):
         set_step(stream, step, float(dataset.fps))
         log_arm(stream, numbers[len(POSE_NAMES) :], numbers[:3])
-
-
-def _log_pictures(stream: rr.RecordingStream, dataset: Any, frames: Sequence[Mapping[str, Any]]) -> None:
-    for step, frame in enumerate(frames):
-        set_step(stream, step, float(dataset.fps))
-        for key in dataset.meta.camera_keys:
-            picture = in_bytes(frame[key]).permute(1, 2, 0).numpy()
-            stream.log(f"cameras/{_camera(key)}", rr.Image(picture).compress(jpeg_quality=JPEG_QUALITY))
 
 
 def _log_phases(stream: rr.RecordingStream, recorded: RecordedEpisode, fps: float) -> None:

@@ -34,7 +34,15 @@ class VlaEvalClient:
         self._n_sent = 0
         self._in_episode = False
         try:
-            self._metadata = self._greet()
+            self._send(HELLO, {"harness_version": CLIENT_VERSION, "protocol_version": PROTOCOL_VERSION})
+            said = self._receive(HELLO)
+            version = said.get("protocol_version")
+            if not (isinstance(version, int) and version == PROTOCOL_VERSION):
+                raise self._connection.refuse(
+                    f"expected version {PROTOCOL_VERSION} of the protocol of vla-eval, found {shown(version)}"
+                )
+            name = said.get("model_server")
+            self._metadata = ServerMetadata(name=name if isinstance(name, str) and name else None, other=said)
         except BaseException:
             connection.close()
             raise
@@ -82,17 +90,6 @@ class VlaEvalClient:
     def close(self) -> None:
         """Close the connection."""
         self._connection.close()
-
-    def _greet(self) -> ServerMetadata:
-        self._send(HELLO, {"harness_version": CLIENT_VERSION, "protocol_version": PROTOCOL_VERSION})
-        said = self._receive(HELLO)
-        version = said.get("protocol_version")
-        if not (isinstance(version, int) and version == PROTOCOL_VERSION):
-            raise self._connection.refuse(
-                f"expected version {PROTOCOL_VERSION} of the protocol of vla-eval, found {shown(version)}"
-            )
-        name = said.get("model_server")
-        return ServerMetadata(name=name if isinstance(name, str) and name else None, other=said)
 
     def _send(self, kind: str, payload: Mapping[str, Any]) -> None:
         self._n_sent += 1

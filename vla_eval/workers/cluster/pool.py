@@ -119,7 +119,14 @@ class ClusterPool[J: Job, A]:
             if machine is None or self._n_free(machine) <= 0:
                 break
             index = next(number for number in range(self._size) if number not in self._workers)
-            actor = self._new_actor(machine, index)
+            actor = self._ray.remote(WorkerActor).options(
+                max_restarts=0,
+                max_task_retries=0,
+                scheduling_strategy=on_machine(machine.node),
+                num_cpus=1,
+                num_gpus=1 if self._takes_gpu else 0,
+            )
+            actor = actor.remote(self._spec, self._place, index, machine.address)
             machine.n_used += 1
             call = actor.ready.remote()
             self._workers[index] = _Worker(machine=machine, actor=actor, call=call, index=index)
@@ -131,16 +138,6 @@ class ClusterPool[J: Job, A]:
 
     def _n_free(self, machine: Machine) -> int:
         return machine.n_free(takes_gpu=self._takes_gpu)
-
-    def _new_actor(self, machine: Machine, index: int) -> Any:
-        actor = self._ray.remote(WorkerActor).options(
-            max_restarts=0,
-            max_task_retries=0,
-            scheduling_strategy=on_machine(machine.node),
-            num_cpus=1,
-            num_gpus=1 if self._takes_gpu else 0,
-        )
-        return actor.remote(self._spec, self._place, index, machine.address)
 
     def _hand_out(self, queue: JobSource[J]) -> None:
         taken: set[Any] = {worker.loaded for worker in self._workers.values() if worker.loaded is not None}
