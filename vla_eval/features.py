@@ -65,10 +65,7 @@ class EncoderSettings:
 
 
 def dataset_features(
-    state: StateKind,
-    *,
-    action_names: tuple[str, ...] = ACTION_NAMES,
-    image_size_px: int = IMAGE_SIZE_PX,
+    state: StateKind, *, action_names: tuple[str, ...] = ACTION_NAMES, image_size_px: int = IMAGE_SIZE_PX
 ) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data
     """Return the fields of a dataset as `LeRobotDataset.create(features=…)` takes them."""
 

@@ -47,7 +47,7 @@ def _notes(audits: Sequence[TaskAudit]) -> list[str]:
     notes = [
         f"Success once / right first choices, in percent of {spread} episodes per cell. A shortcut is named "
         f"where its control beats chance (exact binomial test, p < {ALPHA}) or, where that is measured, "
-        "the blind arm (Fisher's test); `needs memory`: no such control, and the oracle beats every control.",
+        "the blind arm (Fisher's test); `needs memory`: no such control, and the oracle beats every control."
     ]
     n_errors = sum(audit.n_errors for audit in audits)
     if n_errors:

@@ -123,7 +123,4 @@ def _write_filmstrips(runs: "Sequence[StoredRun]", folder: Path) -> None:
     made = write_filmstrips(runs, folder)
     print("\n".join(map(str, made.files)))
     if made.not_captured:
-        print(
-            f"Not captured (--capture-video {N_EPISODES}): {some_of(made.not_captured)}",
-            file=sys.stderr,
-        )
+        print(f"Not captured (--capture-video {N_EPISODES}): {some_of(made.not_captured)}", file=sys.stderr)

@@ -16,10 +16,7 @@ from vla_eval.tasks.catalog import TASKS, task_spec
 
 __all__ = ["EnvSettings", "RenderSettings", "describe_device", "describe_env", "make_env"]
 
-SIMULATORS = {
-    "maniskill": "vla_eval.envs.maniskill:ManiSkillEnv",
-    "fake": "vla_eval.envs.fake:FakeEnv",
-}
+SIMULATORS = {"maniskill": "vla_eval.envs.maniskill:ManiSkillEnv", "fake": "vla_eval.envs.fake:FakeEnv"}
 OFFICIAL = "vla_eval.envs.official:OfficialEnv"
 """In place of `maniskill` for the tasks of the official package, which are its own ManiSkill environments."""
 

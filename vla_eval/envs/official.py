@@ -228,10 +228,7 @@ class OfficialEpisode:
 
     def status(self, *, success: bool) -> TaskStatus:
         """Return what the record says of this step."""
-        said = TaskStatus(
-            phase=None if self._row.phase_source == "none" else self.phase,
-            success=success,
-        )
+        said = TaskStatus(phase=None if self._row.phase_source == "none" else self.phase, success=success)
         if self.candidates is None:
             return said
         target, chosen = self.candidates.target, tuple(self._choices.chosen)

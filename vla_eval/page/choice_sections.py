@@ -26,8 +26,7 @@ EXPLANATIONS: dict[Cause, Explanation] = {
         "the first candidate touched was right, and the episode succeeded (by memory or by luck)",
     ),
     "not_finished": Explanation(
-        "right choice, not finished",
-        "the first candidate touched was right, but the task was not completed",
+        "right choice, not finished", "the first candidate touched was right, but the task was not completed"
     ),
     "wrong": Explanation("wrong choice", "a wrong candidate was touched first"),
     "position_habit": Explanation(

@@ -192,7 +192,7 @@ def grid_notes(table: GridTable) -> list[str]:
         "Success once, over all first inferences; 95 % intervals (Wilson) count a seed as one episode. cue "
         "frames: how many the policy is given (oracle reads the true state). late: steps of the response "
         "before its first inference, whose actions were chosen before it. Each from the least to the most "
-        "over the first inferences.",
+        "over the first inferences."
     ]
     controls = dict.fromkeys(cell.reference for cell in table.cells if cell.reference is not None)
     if controls:

@@ -26,11 +26,7 @@ CONTROLS_OF_ONE = ("body_memory",)
 ITEMS = ("items", "cubes")
 """Kinds of candidates that can be shown, and so can distract."""
 
-MASKS: Mapping[str, CueViewKind] = {
-    "cue": "hidden",
-    "elsewhere": "hidden_elsewhere",
-    "later": "hidden_later",
-}
+MASKS: Mapping[str, CueViewKind] = {"cue": "hidden", "elsewhere": "hidden_elsewhere", "later": "hidden_later"}
 """What of the image is hidden: the cue, as much of the same frames, the same place in the delay."""
 
 APPEARANCES: Mapping[str, AppearanceSettings] = {

@@ -154,10 +154,7 @@ def _has_controls(task: str) -> bool:
 
 
 PAIRED: Statistic[tuple[Comparison | None, ...]] = Statistic(
-    estimate=lambda of: of.comparisons,
-    cells=_paired_cells,
-    column_of=_paired_column,
-    notes=_paired_notes,
+    estimate=lambda of: of.comparisons, cells=_paired_cells, column_of=_paired_column, notes=_paired_notes
 )
 CHANCE: Statistic[Chance | None] = Statistic(
     estimate=lambda of: of.chance,

@@ -16,11 +16,7 @@ from vla_eval.errors import ReportError
 from vla_eval.strict.json_text import Count, Positive, Rate, Source, as_dataclass, loads, read_file, shorten
 
 AuditProtocol = Literal["paper", "strict", "official"]
-STRICT: Mapping[str, bool] = {
-    "freeze_until_choice": True,
-    "strict_choice": True,
-    "phase_gate_success": True,
-}
+STRICT: Mapping[str, bool] = {"freeze_until_choice": True, "strict_choice": True, "phase_gate_success": True}
 
 
 class Rules(NamedTuple):

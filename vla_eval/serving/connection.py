@@ -107,13 +107,7 @@ class ClientConnection:
         self._service.sentences.begin(start)
         return start
 
-    def _answer_later(
-        self,
-        session: Session,
-        request: Mapping[str, Any],
-        done: _Done,
-        begun: float,
-    ) -> None:
+    def _answer_later(self, session: Session, request: Mapping[str, Any], done: _Done, begun: float) -> None:
         session.n_pending += 1
         task = asyncio.create_task(self._answer(session, request, done, begun, session.episode))
         self._replies.add(task)

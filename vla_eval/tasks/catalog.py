@@ -123,13 +123,7 @@ _SHELL_GAME = (
 )
 
 TASKS: dict[str, TaskSpec] = {
-    spec.id: spec
-    for spec in (
-        *_REMEMBER,
-        *SEQUENCE_TASKS,
-        *_SHELL_GAME,
-        *SPATIAL_TASKS,
-    )
+    spec.id: spec for spec in (*_REMEMBER, *SEQUENCE_TASKS, *_SHELL_GAME, *SPATIAL_TASKS)
 }
 
 

@@ -58,11 +58,7 @@ class InterceptGrabEnv(RollingBallEnv):
         grasped, static = self.grasps(self.ball), self.is_static()
         # The tolerance is for a ball that lies on the table: it sinks in by micrometres.
         lifted = self.ball_position_m()[:, 2] >= self.ball_radius_m + self.lift_height_m - 1e-3
-        return {
-            "success": grasped & static & lifted,
-            "is_ball_grasped": grasped,
-            "is_robot_static": static,
-        }
+        return {"success": grasped & static & lifted, "is_ball_grasped": grasped, "is_robot_static": static}
 
     def _in_grip(self) -> Flags:
         offset = np.abs(self._tcp_to_ball_m())

@@ -23,13 +23,7 @@ from vla_eval.tasks.objects.bodies import (
     resting_body,
     velocity_of,
 )
-from vla_eval.tasks.objects.layout import (
-    GOAL_X_M,
-    GOAL_Y_M,
-    START_BAND_WIDTH_M,
-    START_BANDS_Y_M,
-    START_X_M,
-)
+from vla_eval.tasks.objects.layout import GOAL_X_M, GOAL_Y_M, START_BAND_WIDTH_M, START_BANDS_Y_M, START_X_M
 from vla_eval.tasks.objects.limits import BodySize, GoalRadius, Positive
 from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import WithoutCueEnv

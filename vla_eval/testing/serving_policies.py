@@ -31,11 +31,7 @@ class StillPolicy:
 
     def __init__(self, name: str) -> None:
         self.spec = PolicySpec(
-            name=name,
-            reads="last",
-            cameras=tuple(CAMERA_KEYS),
-            states=STATES,
-            chunk_size=STILL_CHUNK_SIZE,
+            name=name, reads="last", cameras=tuple(CAMERA_KEYS), states=STATES, chunk_size=STILL_CHUNK_SIZE
         )
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:

@@ -205,9 +205,7 @@ def lerobot_config(job: TrainingJob) -> Any:
         scheduler=job.policy.get_scheduler_preset(),
         rename_map=dict(recipe.rename_cameras),
         wandb=WandBConfig(  # not used here: for `lerobot-train --resume`
-            enable=recipe.wandb_project is not None,
-            project=recipe.wandb_project or "none",
-            run_id=job.run_id,
+            enable=recipe.wandb_project is not None, project=recipe.wandb_project or "none", run_id=job.run_id
         ),
         peft=peft_config(recipe, job.policy),
     )

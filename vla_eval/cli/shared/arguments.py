@@ -142,11 +142,7 @@ FLAGS: Mapping[str, Mapping[str, Any]] = {
     "--n-action-steps": {**NUMBERS, "metavar": "K", "help": "actions per inference"},
     "--episodes": {"type": int, "metavar": "N"},
     "--seed-start": {"type": int, "metavar": "S", "help": "seed of the first episode (1)"},
-    "--workers": {
-        "type": workers_argument,
-        "metavar": "W",
-        "help": "processes, or 'auto': one per core",
-    },
+    "--workers": {"type": workers_argument, "metavar": "W", "help": "processes, or 'auto': one per core"},
     "--cluster": {
         "metavar": "WHERE",
         "help": "run on a Ray cluster: auto, local or ray://HOST:PORT (docs/cluster.md)",

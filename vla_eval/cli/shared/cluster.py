@@ -12,10 +12,7 @@ from vla_eval.workers.needed_files import Needed
 
 @contextlib.contextmanager
 def backend_of(
-    args: argparse.Namespace,
-    *,
-    needs: Callable[[], tuple[Needed, ...]] = tuple,
-    notes_kinds: bool = True,
+    args: argparse.Namespace, *, needs: Callable[[], tuple[Needed, ...]] = tuple, notes_kinds: bool = True
 ) -> Iterator[Backend]:
     """Give what `--cluster` names, whose machines must have the files of `needs`; else this machine."""
     if args.cluster is None:

@@ -27,11 +27,7 @@ class ReplayRunner(SimulatorRunner[ReplayJob, EpisodeReplayed]):
         env = self._make_env(job.env)
         dataset = self._opened(job)
         log = replay_actions(
-            env,
-            episode.start(),
-            episode.action_rows(),
-            heartbeat=self._heartbeat,
-            with_pictures=job.pixels,
+            env, episode.start(), episode.action_rows(), heartbeat=self._heartbeat, with_pictures=job.pixels
         )
         self._heartbeat("setup")
         rows = rows_of_episode(dataset.columns, episode.episode_index)

@@ -44,9 +44,7 @@ def remembers_in_rows(policy: Any) -> bool:
 
 
 def recall(
-    policy: Remembering,
-    rows: Sequence[Episode],
-    preprocess: Callable[[Sequence[Frame]], dict[str, Any]],
+    policy: Remembering, rows: Sequence[Episode], preprocess: Callable[[Sequence[Frame]], dict[str, Any]]
 ) -> Memory:
     """Return the memory (B, …) after all unseen frames; `preprocess` batches one frame per row."""
     singly = remembers_singly(policy)

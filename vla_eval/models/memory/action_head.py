@@ -17,11 +17,7 @@ LEAST_DOUBT = 1e-4  # squared error of an action in [-1, 1]
 def three_layers(inputs: int, hidden: int, outputs: int) -> nn.Sequential:
     """Return a map from numbers to numbers with two hidden layers."""
     return nn.Sequential(
-        nn.Linear(inputs, hidden),
-        nn.GELU(),
-        nn.Linear(hidden, hidden),
-        nn.GELU(),
-        nn.Linear(hidden, outputs),
+        nn.Linear(inputs, hidden), nn.GELU(), nn.Linear(hidden, hidden), nn.GELU(), nn.Linear(hidden, outputs)
     )
 
 

@@ -89,7 +89,4 @@ def network_stages(config: Any) -> Stages:
     """Return the parts of the network, and the places and steps of a sample that pass through each."""
     n_steps = config.window_steps or EPISODE_STEPS
     n_places = (image_shape(config)[-1] // config.patch_px) ** 2
-    return (
-        Stage(r"network\.(eyes|keys)\.", n_steps * n_places, VISION),
-        Stage(r"network\.", n_steps, HEAD),
-    )
+    return (Stage(r"network\.(eyes|keys)\.", n_steps * n_places, VISION), Stage(r"network\.", n_steps, HEAD))

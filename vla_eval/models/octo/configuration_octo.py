@@ -174,10 +174,7 @@ class MikasaOctoConfig(PortedConfig):
         """What our normalising steps are made from, statistics aside; a base's own are replaced by it."""
         left_alone = () if self.normalize_gripper else (self.gripper.dim,)
         mask = mask_all_but(int(self.action_feature.shape[0]), left_alone=left_alone)
-        return {
-            "fields": {ACTION_KEY: Normalization(kind="mean_std", mask=mask)},
-            "gripper": self.gripper,
-        }
+        return {"fields": {ACTION_KEY: Normalization(kind="mean_std", mask=mask)}, "gripper": self.gripper}
 
     def augmentation(self, camera: str) -> Augmentation:
         """Return how training images of a camera are changed; the first one is cropped, too."""

@@ -74,9 +74,7 @@ _RULES: tuple[_Rule, ...] = (
     _Rule(STEM + r"embedding\.bias", f"{_STEMS}.embedding.bias", _same),
     *_linear(TRUNK + r"obs_(?P<camera>\w+)_projection", r"network.transformer.projections.\g<camera>"),
     _Rule(
-        TRUNK + r"obs_(?P<camera>\w+)_pos_embedding",
-        r"network.transformer.image_positions.\g<camera>",
-        _same,
+        TRUNK + r"obs_(?P<camera>\w+)_pos_embedding", r"network.transformer.image_positions.\g<camera>", _same
     ),
     *_linear(TRUNK + r"task_language_projection", "network.transformer.language_projection"),
     _Rule(TRUNK + r"task_language_pos_embedding", "network.transformer.language_positions", _same),

@@ -65,11 +65,7 @@ def to_ours(weights: Mapping[str, Tensor], sizes: NetworkSizes) -> dict[str, Ten
 
 
 def _encoder(
-    rest: str,
-    tensor: Tensor,
-    prefix: str,
-    names: Iterable[tuple[str, str]],
-    split: tuple[str, ...],
+    rest: str, tensor: Tensor, prefix: str, names: Iterable[tuple[str, str]], split: tuple[str, ...]
 ) -> dict[str, Tensor]:
     if rest == POSITIONS and prefix == OUR_DINO:
         no_class = torch.zeros_like(tensor[:, :1])

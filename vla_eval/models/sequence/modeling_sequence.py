@@ -140,8 +140,7 @@ class SequenceNetwork(nn.Module):
         decided = self.head(torch.cat([tokens, answers], dim=-1)) if is_gated else answers
         actions = self.actions(decided).unflatten(-1, self.shape)
         return Predicted(
-            actions=actions if is_gated else actions.tanh(),
-            goal_m=self.goal(decided) / POSITION_SCALE,
+            actions=actions if is_gated else actions.tanh(), goal_m=self.goal(decided) / POSITION_SCALE
         )
 
 

@@ -83,14 +83,7 @@ class NetworkSizes(VisionSizes):
     @property
     def n_bins(self) -> tuple[int, ...]:
         """Bins of each axis, in the order of `action_grid.AXES`."""
-        return (
-            self.theta_bins,
-            self.phi_bins,
-            self.r_bins,
-            self.roll_bins,
-            self.pitch_bins,
-            self.yaw_bins,
-        )
+        return (self.theta_bins, self.phi_bins, self.r_bins, self.roll_bins, self.pitch_bins, self.yaw_bins)
 
     @property
     def n_translations(self) -> int:

@@ -87,12 +87,7 @@ def input_map(
 
 
 def check_training(
-    facts: TrainingFacts | None,
-    inputs: InputMap,
-    loaded: LoadedPolicy,
-    env: EnvSpec,
-    *,
-    policy: str,
+    facts: TrainingFacts | None, inputs: InputMap, loaded: LoadedPolicy, env: EnvSpec, *, policy: str
 ) -> None:
     """Compare what the policy saw in training with what it will see; raise with all that differs."""
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}

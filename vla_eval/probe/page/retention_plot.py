@@ -9,10 +9,7 @@ from vla_eval.probe.page.png_files import write_beside
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeTable
 
-CURVES: dict[str, str] = {
-    "follows": "follows the cue",
-    "warranted_choice": "follows the cue in both worlds",
-}
+CURVES: dict[str, str] = {"follows": "follows the cue", "warranted_choice": "follows the cue in both worlds"}
 
 
 def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
