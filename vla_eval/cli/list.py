@@ -65,20 +65,16 @@ def print_rows(groups: Groups, *, indent: str = "") -> None:
         if heading and group:
             print(f"{indent}{heading}:")
         for row in group:
-            _print_row(row, widths, f"{indent}  " if heading else indent)
-
-
-def _print_row(row: Row, widths: Sequence[int], indent: str) -> None:
-    cells = [cell.ljust(width) for cell, width in zip(row[:-1], widths[:-1], strict=True)]
-    first, last = f"{indent}{'  '.join(cells)}", row[-1]
-    screen = screen_width(widest=None)
-    if screen is None or len(first) + len("  ") + len(last) <= screen or not last:
-        print(f"{first}  {last}".rstrip())
-    elif screen - len(first) >= NARROWEST:
-        print(filled(last, screen, first=f"{first}  ", rest=" " * (len(first) + len("  "))))
-    else:
-        print(first.rstrip())
-        print(filled(last, screen, first=f"{indent}    ", rest=f"{indent}    "))
+            cells = [cell.ljust(width) for cell, width in zip(row[:-1], widths[:-1], strict=True)]
+            margin, last = f"{indent}  " if heading else indent, row[-1]
+            first, screen = f"{margin}{'  '.join(cells)}", screen_width(widest=None)
+            if screen is None or len(first) + len("  ") + len(last) <= screen or not last:
+                print(f"{first}  {last}".rstrip())
+            elif screen - len(first) >= NARROWEST:
+                print(filled(last, screen, first=f"{first}  ", rest=" " * (len(first) + len("  "))))
+            else:
+                print(first.rstrip())
+                print(filled(last, screen, first=f"{margin}    ", rest=f"{margin}    "))
 
 
 def _tasks(suite: Suite = "paper") -> Groups:

@@ -102,9 +102,11 @@ def _cells(runs: Sequence[_Run]) -> list[GridCell]:
     levels = dict.fromkeys(world.level for world, _ in runs)
     cells = []
     for policy in sorted(policies, key=lambda name: (name in CONTROLS, policies.index(name))):
-        every = _reads_every(
-            [record for _, found in runs for key in found if key[0] == policy for record in found[key]]
-        )
+        records = [record for _, found in runs for key in found if key[0] == policy for record in found[key]]
+        numbers = [(one.n_frames, one.n_inferences) for one in records]
+        known = [(frames, passes) for frames, passes in numbers if frames is not None and passes is not None]
+        # Whether the policy is given every frame; None if no record shows it.
+        every = any(frames > passes for frames, passes in known) if known else None
         # The control that has the same inferences and forgets nothing.
         control = ORACLE if every else CUE_READER
         is_known = every is not None and policy not in CONTROLS and control in policies
@@ -116,16 +118,6 @@ def _cells(runs: Sequence[_Run]) -> list[GridCell]:
                 if own:
                     cells.append(_cell(own, policy, k, every, control if is_known else None))
     return cells
-
-
-def _reads_every(records: Sequence[EpisodeRecord]) -> bool | None:
-    """Return whether a policy is given every frame; None if no record shows it."""
-    known = [
-        (record.n_frames, record.n_inferences)
-        for record in records
-        if record.n_frames is not None and record.n_inferences is not None
-    ]
-    return any(n_frames > n_inferences for n_frames, n_inferences in known) if known else None
 
 
 def _cell(

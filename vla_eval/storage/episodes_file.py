@@ -68,7 +68,14 @@ def repair_records(path: Path, planned: PlannedEpisodes) -> dict[EpisodeKey, Epi
             data = data[: -len(tail)]
     records = parse_records(data, path, planned)
     if tail:  # only now: a file that is refused stays as it was found
-        _set_end(path, size=len(data), complete=is_whole)
+        with open(path, "r+b") as file:
+            if is_whole:
+                file.seek(len(data) - 1)
+                file.write(b"\n")
+                file.flush()
+            else:
+                file.truncate(len(data))
+            os.fsync(file.fileno())
     return records
 
 
@@ -79,17 +86,6 @@ def is_json(tail: bytes) -> bool:
     except (ValueError, RecursionError):
         return False
     return True
-
-
-def _set_end(path: Path, *, size: int, complete: bool) -> None:
-    with open(path, "r+b") as file:
-        if complete:
-            file.seek(size - 1)
-            file.write(b"\n")
-            file.flush()
-        else:
-            file.truncate(size)
-        os.fsync(file.fileno())
 
 
 def shown_key(key: EpisodeKey) -> str:

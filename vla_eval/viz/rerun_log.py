@@ -56,7 +56,11 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvS
             values = np.concatenate([one.chunk.actions for one in own])
             for dim, name in enumerate(env.action.dims):
                 send_curve(stream, f"actions/{name}/predicted_{index}", steps, values[:, dim], env.control_hz)
-        _log_events(stream, tape, record, env.control_hz)
+        for step, text in sorted(events(tape, record)):
+            set_step(stream, step, env.control_hz)
+            stream.log("events", rr.TextLog(text))
+            if text.startswith("first choice"):
+                stream.log("choice/first", rr.Scalars(1.0))
 
 
 def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
@@ -151,16 +155,6 @@ def n_overlapping(tape: EpisodeTape) -> int:
     gaps = [later - earlier for earlier, later in pairwise(starts)]
     longest = max((len(one.chunk.actions) for one in tape.chunks), default=1)
     return -(-longest // max(min(gaps, default=longest), 1))
-
-
-def _log_events(
-    stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord, control_hz: float
-) -> None:
-    for step, text in sorted(events(tape, record)):
-        set_step(stream, step, control_hz)
-        stream.log("events", rr.TextLog(text))
-        if text.startswith("first choice"):
-            stream.log("choice/first", rr.Scalars(1.0))
 
 
 def events(tape: EpisodeTape, record: EpisodeRecord) -> Iterable[tuple[int, str]]:
