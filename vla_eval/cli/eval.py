@@ -52,8 +52,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "or a flag sets others, and its summary figure below the table",
     )
     _add_run_arguments(parser)
-    _add_capture_arguments(parser)
-    _add_table_arguments(parser)
+    for kind, what in (("video", "an mp4"), ("rrd", "a file for the rerun viewer")):
+        parser.add_argument(
+            f"--capture-{kind}",
+            metavar="WHICH",
+            help=f"{what} of all|failures|successes episodes, or of the first N of each row (none)",
+        )
+        add_old_flag(parser, f"--record-{kind}", f"--capture-{kind}")
+    add_table_arguments(parser)
+    parser.add_argument(
+        "--tiny",
+        action="store_true",
+        help="of a table of learned policies: do all of it with tiny random models, without a simulator",
+    )
+    parser.add_argument(
+        "--html", type=Path, metavar="DIR", help="also write a page: DIR/index.html; its path comes last"
+    )
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
@@ -94,28 +108,6 @@ def _add_dry_run_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive_argument,
         metavar="S",
         help="with --dry-run: an inference of a learned policy to assume (0.2)",
-    )
-
-
-def _add_capture_arguments(parser: argparse.ArgumentParser) -> None:
-    for kind, what in (("video", "an mp4"), ("rrd", "a file for the rerun viewer")):
-        parser.add_argument(
-            f"--capture-{kind}",
-            metavar="WHICH",
-            help=f"{what} of all|failures|successes episodes, or of the first N of each row (none)",
-        )
-        add_old_flag(parser, f"--record-{kind}", f"--capture-{kind}")
-
-
-def _add_table_arguments(parser: argparse.ArgumentParser) -> None:
-    add_table_arguments(parser)
-    parser.add_argument(
-        "--tiny",
-        action="store_true",
-        help="of a table of learned policies: do all of it with tiny random models, without a simulator",
-    )
-    parser.add_argument(
-        "--html", type=Path, metavar="DIR", help="also write a page: DIR/index.html; its path comes last"
     )
 
 

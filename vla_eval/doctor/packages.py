@@ -31,7 +31,14 @@ def check_packages(_: Probe) -> Finding:
     wrong = [text for requirement in requirements if (text := _violation(requirement))]
     if wrong:
         return Finding(status="fail", found="; ".join(wrong), advice=SET_UP)
-    untested = _untested_versions()
+    # constraints.txt is only in a checkout.
+    path = PACKAGE_FOLDER.parent / "constraints.txt"
+    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+    untested = []
+    for package, _equals, tested in (line.partition("==") for line in lines if "==" in line):
+        installed = package_version(package)
+        if installed is not None and _public(installed) != _public(tested):
+            untested.append(f"{package} {installed} (tested: {tested})")
     if untested:
         advice = f"These versions are allowed but were not tested together. {SET_UP}"
         return Finding(status="warn", found="; ".join(untested), advice=advice)
@@ -74,18 +81,6 @@ def _violation(requirement: Requirement) -> str | None:
     if requirement.specifier.contains(installed, prereleases=True):
         return None
     return f"{requirement.name} {installed} is not {requirement.specifier}"
-
-
-def _untested_versions() -> list[str]:
-    """Compare with constraints.txt, which only a checkout has."""
-    path = PACKAGE_FOLDER.parent / "constraints.txt"
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    untested = []
-    for name, _, tested in (line.partition("==") for line in lines if "==" in line):
-        installed = package_version(name)
-        if installed is not None and _public(installed) != _public(tested):
-            untested.append(f"{name} {installed} (tested: {tested})")
-    return untested
 
 
 def _public(version: str) -> str:

@@ -33,7 +33,8 @@ class PickExpert:
         mug_m, arm = mug.position_m, model.gripper_state(state)
         rows = []
         for _ in range(n_actions):
-            held = _holds(arm, mug_m)
+            near = float(np.linalg.norm(arm.position_m - mug_m)) < HOLDING_RADIUS_M
+            held = near and arm.width_m < HELD_WIDTH_M
             if held:
                 lift = np.array([0.0, 0.0, goal.position_m[2] + OVERSHOOT_M - mug_m[2]])
                 translation, turn, gripper = (
@@ -56,11 +57,6 @@ class PickExpert:
         """Whether the mug has been lifted."""
         mug, goal = state.bodies[f"mug_{candidate}"], state.bodies[f"goal_{candidate}"]
         return bool(mug.position_m[2] > goal.position_m[2])
-
-
-def _holds(arm: model.ArmState, mug_m: model.Vector) -> bool:
-    near = float(np.linalg.norm(arm.position_m - mug_m)) < HOLDING_RADIUS_M
-    return near and arm.width_m < HELD_WIDTH_M
 
 
 def _to_handle(

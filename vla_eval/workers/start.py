@@ -92,21 +92,8 @@ def begin(
 ) -> None:
     """Run `main` in a guarded worker with this environment; the server keeps that of its own start."""
     fork_guarded(lifeline)
-    _leave_helpers()
-    os.environ.clear()
-    os.environ.update(environment)
-    import_for_workers()  # SAPIEN runs a program when it is imported, which the lock would refuse
-    del os.environ[IMPORTS_VARIABLE]
-    lock()
-    main(*args)
-
-
-def _leave_helpers() -> None:
-    """Close the pipes to the server and to multiprocessing's resource tracker.
-
-    Both end with a traceback if a policy writes into what it has inherited. The tracker is started again if
-    the worker needs one.
-    """
+    # Close the pipes to the server and to multiprocessing's resource tracker: both end with a traceback if a
+    # policy writes into what it has inherited. The tracker is started again if the worker needs one.
     owners: tuple[tuple[Any, str], ...] = (  # there are no public names
         (forkserver._forkserver, "_forkserver_alive_fd"),
         (resource_tracker._resource_tracker, "_fd"),
@@ -116,6 +103,12 @@ def _leave_helpers() -> None:
         if descriptor is not None:
             os.close(descriptor)
             setattr(owner, name, None)
+    os.environ.clear()
+    os.environ.update(environment)
+    import_for_workers()  # SAPIEN runs a program when it is imported, which the lock would refuse
+    del os.environ[IMPORTS_VARIABLE]
+    lock()
+    main(*args)
 
 
 def server_is_stopped() -> bool:

@@ -25,7 +25,18 @@ def draw_sheet(dataset: OpenDataset) -> bytes:
     labels: Sequence[str] = ()
     manifest = dataset.manifest
     for number, (base_TCHW, wrist_TCHW) in zip(chosen, videos, strict=True):
-        moments = _moments(dataset, number)
+        # As many moments for every episode of a dataset.
+        last = dataset.lengths[number] - 1
+        episodes = dataset.manifest
+        if episodes and episodes[0].cue_steps:
+            episode = episodes[number]
+            choice = episode.cue_steps + episode.delay_steps
+            moments = [("cue", 0), ("choice", choice), ("last", last)]
+            if all(one.delay_steps for one in episodes):
+                moments.insert(1, ("delay", episode.cue_steps))
+        else:
+            moments = [("first", 0), ("1/3", last // 3), ("2/3", 2 * last // 3), ("last", last)]
+        moments = [(label, min(step, last)) for label, step in moments]
         labels = [*(f"base, {label}" for label, _ in moments), "wrist, last"]
         steps = [step for _, step in moments]
         pictures = [*base_TCHW[steps], wrist_TCHW[-1]]
@@ -36,18 +47,3 @@ def draw_sheet(dataset: OpenDataset) -> bytes:
             )
         )
     return contact_sheet(labels, rows)
-
-
-def _moments(dataset: OpenDataset, number: int) -> list[tuple[str, int]]:
-    """Return what to show of an episode, and at which frame; as many for every episode of a dataset."""
-    last = dataset.lengths[number] - 1
-    episodes = dataset.manifest
-    if episodes and episodes[0].cue_steps:
-        episode = episodes[number]
-        choice = episode.cue_steps + episode.delay_steps
-        moments = [("cue", 0), ("choice", choice), ("last", last)]
-        if all(one.delay_steps for one in episodes):
-            moments.insert(1, ("delay", episode.cue_steps))
-    else:
-        moments = [("first", 0), ("1/3", last // 3), ("2/3", 2 * last // 3), ("last", last)]
-    return [(label, min(step, last)) for label, step in moments]

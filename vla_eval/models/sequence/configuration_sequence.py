@@ -65,7 +65,18 @@ class MikasaSequenceConfig(EpisodeConfig):
         counts = ("width", "layers", "heads", "context_steps")
         check_bounds(self, {**dict.fromkeys(counts, (1, math.inf)), "dropout": (0, BELOW_ONE)})
         self._check_width()
-        self._check_returns()
+        kinds = get_args(RewardKind)
+        if self.reads_returns and self.reward not in kinds:
+            raise RecipeError(
+                f"reward is {self.reward}, expected {' or '.join(kinds)}: tokens={self.tokens} reads the "
+                "return to go"
+            )
+        if not self.reads_returns and (self.reward is not None or self.target_return is not None):
+            raise RecipeError(
+                f"reward and target_return belong to tokens=return_observation[_action], found {self.tokens}"
+            )
+        if self.reward == "sparse" and self.target_return is None:
+            self.target_return = 1.0
 
     @property
     def reads_returns(self) -> bool:
@@ -114,20 +125,6 @@ class MikasaSequenceConfig(EpisodeConfig):
         valve = options.valve_heads if isinstance(options, TransformerXLOptions) else 0
         if valve and self.width % valve:
             raise RecipeError(f"width is {self.width}, expected a multiple of valve_heads ({valve})")
-
-    def _check_returns(self) -> None:
-        kinds = get_args(RewardKind)
-        if self.reads_returns and self.reward not in kinds:
-            raise RecipeError(
-                f"reward is {self.reward}, expected {' or '.join(kinds)}: tokens={self.tokens} reads the "
-                "return to go"
-            )
-        if not self.reads_returns and (self.reward is not None or self.target_return is not None):
-            raise RecipeError(
-                f"reward and target_return belong to tokens=return_observation[_action], found {self.tokens}"
-            )
-        if self.reward == "sparse" and self.target_return is None:
-            self.target_return = 1.0
 
 
 def network_stages(config: Any) -> Stages:
