@@ -200,12 +200,7 @@ def _build(source: FrameSource, final: Path) -> None:
     draft.mkdir()
     try:
         for camera, shape in source.shapes.items():
-            # Written, not mapped: a full disk is then an error that can be caught instead of a SIGBUS.
-            with open(draft / f"{camera}.npy", "wb") as file:
-                header = {"descr": "|u1", "fortran_order": False, "shape": (source.n_frames, *shape)}
-                np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]  # numpy 2.2
-                for frames in decode_camera(source, camera):
-                    file.write(np.ascontiguousarray(frames).data)
+            _write_camera(source, camera, draft / f"{camera}.npy", (source.n_frames, *shape))
         draft.rename(final)
     except OSError as exc:
         # Where files cannot be locked another process may have been faster; its frames are the same.
@@ -218,6 +213,15 @@ def _build(source: FrameSource, final: Path) -> None:
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     logger.info("decoded %d frames into %s", source.n_frames, final)
+
+
+def _write_camera(source: FrameSource, camera: str, path: Path, shape: tuple[int, ...]) -> None:
+    # Written, not mapped: a full disk is then an error that can be caught instead of a SIGBUS.
+    with open(path, "wb") as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)  # type: ignore[no-untyped-call]  # numpy 2.2
+        for frames in decode_camera(source, camera):
+            file.write(np.ascontiguousarray(frames).data)
 
 
 @contextlib.contextmanager
