@@ -3,6 +3,7 @@
 Most tests let torch trace the network and run its operations as they are: a compiler takes a minute each.
 """
 
+import dataclasses
 import functools
 from collections.abc import Iterator
 from pathlib import Path
@@ -28,6 +29,7 @@ from vla_eval.errors import SpecMismatchError
 from vla_eval.models.families import FAMILIES
 from vla_eval.policies.compiled import Compilation, CompiledPolicy
 from vla_eval.policies.lerobot import compiling
+from vla_eval.policies.lerobot.paper_compat import PaperCompatPolicy
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import EnvSpec
 from vla_eval.testing.tiny_models import make_tiny
@@ -55,8 +57,6 @@ def made(folder: Path, env: EnvSpec, *, n_slots: int = 1, **args: Any) -> LeRobo
     maker: Any = make_tiny if "pi0" in folder.parent.name else make_lerobot
     context = context_for(env)
     if n_slots > 1:
-        import dataclasses
-
         context = dataclasses.replace(context, n_slots=n_slots)
     policy: LeRobotPolicy = maker(context, checkpoint=str(folder), **args)
     return policy
@@ -130,6 +130,16 @@ class TestWarmUp:
 
         with pytest.raises(SpecMismatchError, match="nothing of its network could be compiled"):
             policy.warm_up(env, ())
+
+    def test_a_policy_that_acts_as_the_paper_did_is_warmed_up_like_the_one_in_it(
+        self, act: Path, env: EnvSpec, traced: list[dict[str, Any]]
+    ) -> None:
+        policy = PaperCompatPolicy(made(act, env, compile=True), ["gripper_sign"], n_action_steps=4)
+
+        found = policy.warm_up(env, ())
+
+        assert isinstance(policy, CompiledPolicy)
+        assert found is not None and found.difference == 0
 
     def test_one_shape_too_many_is_an_error_and_is_not_computed_otherwise(
         self, act: Path, env: EnvSpec, traced: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch

@@ -24,8 +24,10 @@ from PIL import Image
 from vla_eval.core import ActionChunk, EpisodeStart, ImageArray, Observation, ObservationWindow
 from vla_eval.errors import RecipeError, check_names
 from vla_eval.models.shared.gripper import Gripper
+from vla_eval.policies.compiled import Compilation
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
+from vla_eval.specs import EnvSpec
 
 SWITCHES = ("gripper_sign", "last_k_queue", "jpeg")
 JPEG_QUALITY = 95  # TensorFlow's default, which the original leaves as it is
@@ -43,6 +45,10 @@ class PaperCompatPolicy:
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Begin these episodes."""
         self._policy.reset(episodes)
+
+    def warm_up(self, env: EnvSpec, sentences: Sequence[str]) -> Compilation | None:
+        """Compile the network, if that was asked for; see `LeRobotPolicy.warm_up`."""
+        return self._policy.warm_up(env, sentences)
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Decide for one episode."""
