@@ -156,9 +156,13 @@ def test_a_mistyped_mode_a_motion_it_cannot_make_and_another_arm_are_refused() -
         make_env(EnvSettings(task=TASK, kwargs={"control_mode": JOINT_POS}, simulator="fake"))
 
 
-@pytest.mark.parametrize("size", [15, 2049, "256", True, 64.0])
-def test_an_impossible_image_size_is_refused(size: object) -> None:
-    with pytest.raises(TaskArgumentError, match=r"image_size=.*: expected 16 to 2048 pixels"):
+@pytest.mark.parametrize(
+    ("size", "expected"),
+    [(15, "16 to 2048 pixels"), (2049, "16 to 2048 pixels")]
+    + [(size, "a whole number") for size in ("256", True, 64.0)],
+)
+def test_an_impossible_image_size_is_refused(size: object, expected: str) -> None:
+    with pytest.raises(TaskArgumentError, match=f"image_size.*: expected {expected}"):
         env_in(EE_DELTA_POSE, image_size=size)
 
 
