@@ -15,6 +15,7 @@ TOOLS = (
     *("ldconfig", "ld", "objdump"),  # `ctypes.util.find_library`
     *("gcc", "g++", "cc", "c++", "clang", "clang++", "as", "ptxas", "nvcc"),  # `torch.compile`, triton
     *("uname", "lscpu", "nvidia-smi"),  # `platform`, torch: which machine this is
+    "fc-list",  # matplotlib, when it is first used by someone: which fonts there are
     *("ffmpeg", "ffprobe"),
 )
 """Programs that libraries start of their own accord: those of the system, or first on the search path."""

@@ -7,16 +7,12 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager
 from xml.etree import ElementTree
 
+import matplotlib
+import matplotlib.style
 from markupsafe import Markup
-
-from vla_eval.lock.switch import own_need
-
-with own_need():  # the first time for a user, it asks a program which fonts there are
-    import matplotlib
-    import matplotlib.style
-    from matplotlib.figure import Figure
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import text_to_path
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
 
 # Variables of page.css with their light values: a color of a figure is replaced by the variable.
 PALETTE: Mapping[str, str] = {
