@@ -5,7 +5,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vla_eval.cli.shared.arguments import NUMBERS, task_argument
+from vla_eval.cli.shared.arguments import MANY, NUMBERS, task_argument
 from vla_eval.errors import MissingDependencyError
 from vla_eval.strict.bounds import MAX_STEPS, check_bounds
 
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--policy",
-        nargs="+",
+        **MANY,
         default=["act", "memory", "recurrent"],
         metavar="P",
         help="with --loader: recipes whose batches are loaded (default: %(default)s)",
