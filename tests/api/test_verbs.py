@@ -112,8 +112,9 @@ SMALL = {
 }
 
 
+@pytest.mark.parametrize("recorded_on", ["fake", pytest.param("maniskill", marks=pytest.mark.slow)])
 def test_the_page_on_python_is_a_script_without_a_main_guard_also_after_the_fake_simulator(
-    tmp_path: Path,
+    recorded_on: str, tmp_path: Path
 ) -> None:
     page = (Path(__file__).parents[2] / "docs" / "python.md").read_text(encoding="utf-8")
     blocks = [block.partition("```")[0] for block in page.split("```python\n")[1:]]
@@ -121,6 +122,7 @@ def test_the_page_on_python_is_a_script_without_a_main_guard_also_after_the_fake
     for shown, small in SMALL.items():
         assert shown in script
         script = script.replace(shown, small)
+    script = script.replace("workers=2", f'workers=2, simulator="{recorded_on}"')
     (tmp_path / "script.py").write_text(f"{script}\nprint(run, dataset.was_replayed)", "utf-8")
     done = subprocess.run(
         [sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, timeout=600, check=False
