@@ -22,6 +22,7 @@ TASK = "RememberColor3-v0"
 SEEDS, RENDERED_STEPS = (1, 2), 10
 BATCHES = (1, 8, 16)
 TRAINING_STEPS = 5
+EVALUATED_K = 8
 GB = 1e9
 REHEARSED = ("smolvla", "pi0", "pi05", "openvla_oft")
 LEFT_OVER = ("rehearsal", "training")
@@ -125,6 +126,62 @@ def short_training(check: Check) -> dict[str, Any]:
     return {"training_seconds": seconds, "lines": table.stdout.splitlines()}
 
 
+def whole_evaluations(check: Check) -> dict[str, Any]:
+    """Evaluate a full-size policy of random weights in one server, as it is and compiled."""
+    folder = check.out / "rehearsal"
+    folder.mkdir(parents=True)
+    _write_random_checkpoint(folder / "model", "octo_tiny" if check.tiny else "pi0")
+    return {
+        name: _evaluated(check, folder / "model", compiles=compiles)
+        for name, compiles in (("as it is", False), ("compiled", True))
+        if not (check.tiny and compiles)  # it takes minutes on a CPU
+    }
+
+
+def _write_random_checkpoint(folder: Path, name: str) -> None:
+    from vla_eval.checkpoints.loading import make_unfilled_policy
+    from vla_eval.config.finetuning import FinetuneConfig
+    from vla_eval.testing.random_checkpoint import stand_in_config, write_checkpoint
+    from vla_eval.training.request import load_finetune_recipe
+
+    fields = {"policy": {"chunk_size": EVALUATED_K, "n_action_steps": EVALUATED_K}}
+    changes = {} if name == "octo_tiny" else fields
+    recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none", finetune=changes)).value
+    config, tokenizer = stand_in_config(recipe, folder.parent, dtype=None, tiny=False)
+    folder.mkdir()
+    write_checkpoint(folder, config, make_unfilled_policy(config), tokenizer)
+
+
+def _evaluated(check: Check, model: Path, *, compiles: bool) -> dict[str, Any]:
+    """Return episodes per minute, start-up included, and the shares of the workers' time."""
+    from vla_eval.storage.timings import read_timings
+
+    n_workers = len(os.sched_getaffinity(0))
+    out = check.out / f"evaluation-{'compiled' if compiles else 'plain'}"
+    shutil.rmtree(out, ignore_errors=True)
+    settings = {"inference": "shared", "inference_max_batch": n_workers, "compile": str(compiles).lower()}
+    if check.tiny:
+        settings["simulator"] = "fake"
+    started = time.perf_counter()
+    table = _command(
+        *("eval", "--task", TASK, "--policy", f"random_weights={model}", "--workers", str(n_workers)),
+        *("--n-action-steps", "4" if check.tiny else str(EVALUATED_K), "--out", str(out)),
+        *("--episodes", "2" if check.tiny else "100"),
+        *(word for name, value in settings.items() for word in ("--set", f"{name}={value}")),
+    )
+    seconds = time.perf_counter() - started
+    timings = read_timings(out).values()
+    total = sum(timing.total_seconds for timing in timings)
+    return {
+        "seconds": seconds,
+        "episodes_per_minute": 60 * len(timings) / seconds,
+        "share_of_inference": sum(timing.inference_seconds for timing in timings) / total,
+        "share_of_steps_and_frames": sum(timing.step_seconds for timing in timings) / total,
+        "share_of_resets": sum(timing.reset_seconds for timing in timings) / total,
+        "lines": table.stdout.splitlines(),
+    }
+
+
 def gpu_simulator(check: Check) -> dict[str, Any]:
     """Run the tests of the GPU simulator."""
     if check.device != "cuda":
@@ -146,6 +203,7 @@ PARTS: dict[str, Callable[[Check], dict[str, Any]]] = {
         rehearsals,
         training_steps,
         short_training,
+        whole_evaluations,
         gpu_simulator,
     )
 }
