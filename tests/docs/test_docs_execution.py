@@ -25,7 +25,7 @@ NOT_EXECUTED: Mapping[str, str] = {
     r"audit --suite .*|audit": "oracles of all tasks, which the fake simulator has not; tests/audit",
     r"bench --against-official official.*": "the official package; tests/bench/test_official_bench.py",
     r"bench( --against-official| --serve.*)?": "measures this machine; tests/bench",
-    r"checkpoint convert-.*": "original weights; tests/checkpoints/test_conversion.py",
+    r"checkpoint convert-.*": "original weights; tests/models/octo/test_octo_convert.py",
     r"checkpoint fetch .*|.*hub:.*": "the Hub; tests/checkpoints/test_fetching.py",
     r"checkpoint merge .*": "an adapter of a trained VLA; tests/training/test_prompted_to_eval.py",
     r"checkpoint rehearse .*": "a network of 450 million parameters; tests/testing/test_rehearsal.py",
