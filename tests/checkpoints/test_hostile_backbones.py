@@ -201,7 +201,7 @@ class TestEveryField:
                 self._loaded = LoadedPolicy(
                     folder=tmp_path, config=config, policy=policy, preprocessor=None, postprocessor=None
                 )
-                self._readings = Readings()
+                self._readings, self._is_compiled = Readings(), False
 
         start = types.SimpleNamespace(instruction="lift it")
         episode: Any = types.SimpleNamespace(seed=lambda: 0, start=start)

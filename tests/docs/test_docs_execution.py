@@ -56,13 +56,13 @@ NOT_EXECUTED: Mapping[str, str] = {
 SLOW = (
     r"audit .*strict.*|check (DIR --task|my).*|dataset convert data/npz.*|merge .*|record .*--shard .*"
     r"|finetune (paper|ablations).*|finetune --policy (openvla|pi0|spatialvla).*|report .*--html.*"
-    r"|probe .*(=runs/|memory_|grid|probe --).*"
+    r"|bench --loader.*|probe .*(=runs/|memory_|grid|probe --).*"
 )
 FINDINGS = {"dataset check data/foreign"}
 """Commands that say by their exit code that something has to be changed: here the commands of the gripper."""
 SMALL: Mapping[str, tuple[str, ...]] = {
     "audit": stand_ins.SMALL[:4],
-    "bench": ("--samples", "4", "--repeats", "1"),
+    "bench": ("--batches", "1", "--repeats", "1"),
     "eval": ("--dry-run",),
     "finetune": ("--dry-run",),
     "probe": stand_ins.SMALL,

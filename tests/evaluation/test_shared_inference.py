@@ -158,7 +158,7 @@ def test_a_network_is_compiled_in_the_thread_that_asks_it_and_tables_say_how_far
 
     notes = [note for session in read_run(network.folder / "out").sessions for note in session.sentences]
     (note,) = notes
-    assert f"(float32, {n_rows} in a pass)" in note
+    assert f"The network of night was compiled (float32, {n_rows} in a pass)" in note
     assert "of at most 0.9, differ by at most 0.002" in note
 
 

@@ -181,8 +181,8 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
             with with_servers(phase, resolved, plan, logs=logs, stops=stops) as ready:
                 if ready is None:
                     return True
-                for note in () if ready.servers is None else ready.servers.notes:
-                    bookkeeper.folder.note(note)
+                for found in () if ready.servers is None else ready.servers.compiled:
+                    bookkeeper.folder.note(found.note(phase.policy or ""))
                 bookkeeper.queue = JobQueue(ready.jobs, finished={*finished, *bookkeeper.keys})
                 size = worker_count(resolved, plan, n_jobs=bookkeeper.queue.n_batches)
                 pool: EpisodePool = resolved.backend.pool(spec, size=size)

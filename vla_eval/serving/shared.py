@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Self
 
 from vla_eval.errors import VlaEvalError
+from vla_eval.policies.compiled import Compilation
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.serving.metrics import ServerMetrics
 from vla_eval.serving.server import ServerOptions, run_server
@@ -51,7 +52,7 @@ class ServerReady:
 
     port: int
     metadata: ServerMetadata
-    notes: tuple[str, ...]  # about its compiled network
+    compiled: Compilation | None  # what it found of its compiled network
 
 
 class SharedServers:
@@ -86,9 +87,9 @@ class SharedServers:
         return self._ready[0].metadata
 
     @property
-    def notes(self) -> tuple[str, ...]:
-        """What the servers say of their compiled networks."""
-        return tuple(dict.fromkeys(note for ready in self._ready for note in ready.notes))
+    def compiled(self) -> tuple[Compilation, ...]:
+        """What the servers found of their compiled networks."""
+        return tuple(ready.compiled for ready in self._ready if ready.compiled is not None)
 
     @property
     def was_stopped(self) -> bool:
@@ -176,14 +177,15 @@ def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
         os.environ[VISIBLE_GPUS] = job.gpu  # before torch looks for GPUs
     try:
         hosted = host_policy(job.host)
-        notes: list[str] = []
+        found: list[Compilation] = []
         run_server(
             hosted,
             ServerOptions(host=job.address, port=0, api_key=job.api_key),
             ready=lambda port: send_message(
-                connection, ServerReady(port=port, metadata=hosted.metadata, notes=tuple(notes))
+                connection,
+                ServerReady(port=port, metadata=hosted.metadata, compiled=next(iter(found), None)),
             ),
-            on_compiled=lambda found: notes.append(found.note(job.host.policy)),
+            on_compiled=found.append,
             ends=lambda: _wait_for_parent(connection),
             metrics=ServerMetrics(on_pass=functools.partial(add_count, shared)),
         )
