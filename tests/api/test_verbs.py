@@ -112,7 +112,8 @@ SMALL = {
 }
 
 
-@pytest.mark.parametrize("recorded_on", ["fake", pytest.param("maniskill", marks=pytest.mark.slow)])
+@pytest.mark.slow  # what it does is tried by itself above, and without a main guard in `test_evaluate`
+@pytest.mark.parametrize("recorded_on", ["fake", "maniskill"])
 def test_the_page_on_python_is_a_script_without_a_main_guard_also_after_the_fake_simulator(
     recorded_on: str, tmp_path: Path
 ) -> None:

@@ -17,7 +17,6 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 import torch
 from accelerate import Accelerator
-from lerobot.datasets.factory import make_dataset
 from lerobot.utils.collate import lerobot_collate_fn
 from torch.utils.data import DataLoader
 
@@ -29,7 +28,7 @@ from vla_eval.data.recording.record import record
 from vla_eval.errors import ConformanceError, RecipeError
 from vla_eval.features import ACTION_KEY, IMAGE_SHAPE, REWARD_KEY
 from vla_eval.training.job import TrainingJob, lerobot_config, training_job
-from vla_eval.training.loop import dataset_of, loader_of
+from vla_eval.training.loop import dataset_of, lerobots_dataset, loader_of
 
 TASK = "RememberColor3-v0"
 N_EPISODES = 4  # of the dataset that is made if none is named
@@ -151,8 +150,7 @@ def _theirs(job: TrainingJob, config: Any) -> Any:
             f"bench: policy '{job.name}' is trained on earlier frames of its choice, which lerobot's loader "
             "does not serve. Name others with --policy."
         )
-    with job.dataset.local.readers():
-        return make_dataset(config)
+    return lerobots_dataset(job, config)
 
 
 def _lerobots_loader(dataset: Any, config: Any, order: Sequence[int], n_batches: int) -> Any:

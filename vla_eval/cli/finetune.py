@@ -200,7 +200,9 @@ def _config(args: argparse.Namespace) -> FinetuneConfig:
             if value is not None:
                 set_field(FinetuneConfig, data, path, value, where="command line")
         if isinstance(data.setdefault("finetune", {}), dict):  # anything else is refused when it is decoded
-            free = _policy_paths() if args.overrides else {}
+            own = FinetuneRecipe.__annotations__
+            asks = any(one.partition("=")[0].partition(".")[0] not in own for one in args.overrides or ())
+            free = _policy_paths() if asks else {}
             apply_overrides(data["finetune"], args.overrides, cls=FinetuneRecipe, free=free)
 
     if args.tasks is not None:

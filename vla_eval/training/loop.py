@@ -223,14 +223,19 @@ def autocast_dtype(policy: Any, device: str) -> torch.dtype | None:
 
 def dataset_of(job: TrainingJob, config: Any) -> Any:
     """Return lerobot's dataset, or one that serves the same from decoded frames."""
-    with job.dataset.local.readers():
-        dataset = make_dataset(config)
+    dataset = lerobots_dataset(job, config)
     job.dataset.local.release()
     if job.sample_memory is not None:
         return RememberedFramesDataset(dataset, job.sample_memory)
     if job.recipe.decode_ahead:
         return DecodedFramesDataset(dataset, whole_episodes=job.whole_episodes, reward=job.reward)
     return dataset
+
+
+def lerobots_dataset(job: TrainingJob, config: Any) -> Any:
+    """Return lerobot's dataset of a training."""
+    with job.dataset.local.readers():
+        return make_dataset(config)
 
 
 def loader_of(job: TrainingJob, config: Any, dataset: Any, accelerator: Accelerator) -> Any:
