@@ -26,6 +26,7 @@ EVALUATED_K = 8
 GB = 1e9
 REHEARSED = ("smolvla", "pi0", "pi05", "openvla_oft")
 LEFT_OVER = ("rehearsal", "training")
+FROM_SCRATCH, LOOP_STEPS = ("act", "memory", "recurrent"), 30
 LORA = ("pi0_lora", "openvla_oft")
 WITH_MEMORY = ("smolvla_frames", "pi05_frames", "pi05_memory_tokens")
 
@@ -98,13 +99,40 @@ def training_steps(check: Check) -> dict[str, Any]:
     return {name: _or_reason(lambda name=name: _training(check, name)) for name in names}
 
 
+def training_loops(check: Check) -> dict[str, Any]:
+    """Measure our training loop against LeRobot's own: seconds per step, and how much of it waits."""
+    from loop_speed import measure_loops
+
+    dataset, out = _demonstrations(check), check.out / "training"
+    found: dict[str, Any] = {}
+    for name in ("diffusion_small",) if check.tiny else (*FROM_SCRATCH, "smolvla", "pi0_lora"):
+        changes: dict[str, Any] = {}
+        if name not in FROM_SCRATCH and not check.tiny:
+            _write_random_checkpoint(out / f"{name}-base", name)
+            changes = {"base_checkpoint": str(out / f"{name}-base")}
+        n_steps = 5 if check.tiny else LOOP_STEPS
+        found[name] = _or_reason(
+            lambda name=name, changes=changes, n_steps=n_steps: measure_loops(
+                name, dataset, out, device=check.device, n_steps=n_steps, changes=changes
+            )
+        )
+    return found
+
+
+def _demonstrations(check: Check) -> Path:
+    """Record demonstrations, if that was not done; return the dataset."""
+    data = check.out / "demos"
+    simulator = ["--set", "simulator=fake"] if check.tiny else []
+    n = "3" if check.tiny else "50"
+    _command("record", "--task", TASK, "--episodes", n, "--out", str(data), *simulator)
+    return data / TASK
+
+
 def short_training(check: Check) -> dict[str, Any]:
     """Record, train `memory` shortly, and evaluate it."""
-    data, run = check.out / "demos", check.out / "memory"
+    dataset, run = _demonstrations(check), check.out / "memory"
     few = check.tiny
     simulator = ["--set", "simulator=fake"] if few else []
-    _command("record", "--task", TASK, "--episodes", "3" if few else "50", "--out", str(data), *simulator)
-    dataset = data / TASK
     steps = ["--steps", "2" if few else "1000", "--set", "num_workers=0"]
     tiny = ["--set", "save_every_steps=2", "--set", "log_every_steps=1"] if few else []
     arguments = ["--policy", "memory", "--dataset", str(dataset), "--out", str(run), "--allow-unreplayed"]
@@ -145,7 +173,7 @@ def _write_random_checkpoint(folder: Path, name: str) -> None:
     from vla_eval.training.request import load_finetune_recipe
 
     fields = {"policy": {"chunk_size": EVALUATED_K, "n_action_steps": EVALUATED_K}}
-    changes = {} if name == "octo_tiny" else fields
+    changes = fields if name == "pi0" else {}
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none", finetune=changes)).value
     config, tokenizer = stand_in_config(recipe, folder.parent, dtype=None, tiny=False)
     folder.mkdir()
@@ -202,6 +230,7 @@ PARTS: dict[str, Callable[[Check], dict[str, Any]]] = {
         golden,
         rehearsals,
         training_steps,
+        training_loops,
         short_training,
         whole_evaluations,
         gpu_simulator,

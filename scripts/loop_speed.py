@@ -53,6 +53,7 @@ def _ours(job: Any) -> Seconds:
     from vla_eval.training.loop import Listeners, train
 
     steps: Seconds = []
+    job.out.mkdir(parents=True)
     nothing: Callable[..., None] = lambda *_: None  # noqa: E731
     train(
         job,
