@@ -1,6 +1,8 @@
 """Flags on top of a file: whatever the file holds, the result is a configuration or one message."""
 
+import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -157,3 +159,31 @@ def test_a_bench_takes_what_it_takes_by_default() -> None:
     args = build_parser(("bench",)).parse_args(["bench"])
 
     assert (args.repeats, args.batches, args.n_action_steps) == (2, 4, [1, 4, 8])
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        "eval --task RememberColor3-v0 --policy oracle --dry-run",
+        "finetune --policy act --dataset nowhere --dry-run",
+        "finetune --policy act --dataset {recorded}",
+    ],
+)
+def test_a_folder_that_may_not_be_changed_is_refused_before_work_begins(
+    command: str,
+    folder: Path,
+    recorded: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    asked = os.access
+    closed = str(folder)
+
+    def access(path: Any, mode: int) -> bool:  # a test may run as a user who may do anything
+        return str(path) != closed and asked(path, mode)
+
+    monkeypatch.setattr("vla_eval.storage.folders.os.access", access)
+    words = command.format(recorded=recorded).split()
+
+    assert f"this user has no permission for {folder}" in fails([*words, "--out", str(folder / "x")], capsys)
+    assert not (folder / "x").exists()

@@ -111,9 +111,10 @@ def run(args: argparse.Namespace) -> int:
         )
     config, command = _config(args), typed_command()
     if args.dry_run:
-        from vla_eval.training.request import look_for
+        from vla_eval.training.request import look_for, run_folder_of
 
         look_for(config, is_dry=True)  # before torch is imported
+        check_writable(run_folder_of(config))
         from vla_eval.training.dry_run import describe_finetuning
 
         with contextlib.redirect_stdout(sys.stderr), dry_run_options(args) as options:
