@@ -26,7 +26,9 @@ EVALUATED_K = 8
 GB = 1e9
 REHEARSED = ("smolvla", "pi0", "pi05", "openvla_oft")
 LEFT_OVER = ("rehearsal", "training")
-FROM_SCRATCH, LOOP_STEPS = ("act", "memory", "recurrent"), 30
+LOOPS = {"act": False, "memory": False, "recurrent": False, "smolvla": True, "pi0_lora": True}
+"""Recipe -> whether it begins from a base."""
+LOOP_STEPS = 30
 LORA = ("pi0_lora", "openvla_oft")
 WITH_MEMORY = ("smolvla_frames", "pi05_frames", "pi05_memory_tokens")
 
@@ -103,20 +105,20 @@ def training_loops(check: Check) -> dict[str, Any]:
     """Measure our training loop against LeRobot's own: seconds per step, and how much of it waits."""
     from loop_speed import measure_loops
 
-    dataset, out = _demonstrations(check), check.out / "training"
-    found: dict[str, Any] = {}
-    for name in ("diffusion_small",) if check.tiny else (*FROM_SCRATCH, "smolvla", "pi0_lora"):
-        changes: dict[str, Any] = {}
-        if name not in FROM_SCRATCH and not check.tiny:
-            _write_random_checkpoint(out / f"{name}-base", name)
-            changes = {"base_checkpoint": str(out / f"{name}-base")}
-        n_steps = 5 if check.tiny else LOOP_STEPS
-        found[name] = _or_reason(
-            lambda name=name, changes=changes, n_steps=n_steps: measure_loops(
-                name, dataset, out, device=check.device, n_steps=n_steps, changes=changes
-            )
-        )
-    return found
+    dataset, n_steps = _demonstrations(check), 5 if check.tiny else LOOP_STEPS
+
+    def measure(name: str, *, has_base: bool) -> dict[str, Any]:
+        out, changes = check.out / "training" / name, {}
+        if has_base:
+            _write_random_checkpoint(out / "base", name)
+            changes = {"base_checkpoint": str(out / "base")}
+        return measure_loops(name, dataset, out, device=check.device, n_steps=n_steps, changes=changes)
+
+    names = {"diffusion_small": False} if check.tiny else LOOPS
+    return {
+        name: _or_reason(lambda name=name, has_base=has_base: measure(name, has_base=has_base))
+        for name, has_base in names.items()
+    }
 
 
 def _demonstrations(check: Check) -> Path:
@@ -157,7 +159,6 @@ def short_training(check: Check) -> dict[str, Any]:
 def whole_evaluations(check: Check) -> dict[str, Any]:
     """Evaluate a full-size policy of random weights in one server, as it is and compiled."""
     folder = check.out / "rehearsal"
-    folder.mkdir(parents=True)
     _write_random_checkpoint(folder / "model", "octo_tiny" if check.tiny else "pi0")
     return {
         name: _evaluated(check, folder / "model", compiles=compiles)
@@ -175,8 +176,8 @@ def _write_random_checkpoint(folder: Path, name: str) -> None:
     fields = {"policy": {"chunk_size": EVALUATED_K, "n_action_steps": EVALUATED_K}}
     changes = fields if name == "pi0" else {}
     recipe = load_finetune_recipe(FinetuneConfig(policy=name, dataset="none", finetune=changes)).value
+    folder.mkdir(parents=True)
     config, tokenizer = stand_in_config(recipe, folder.parent, dtype=None, tiny=False)
-    folder.mkdir()
     write_checkpoint(folder, config, make_unfilled_policy(config), tokenizer)
 
 

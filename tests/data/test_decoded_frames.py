@@ -130,7 +130,7 @@ def test_a_loader_in_other_processes_maps_the_file_instead_of_copying_it(root: P
     assert_same(pickle.loads(travelled)[20], ours[20])
 
 
-@pytest.mark.slow  # a spawned process imports torch and lerobot anew
+@pytest.mark.slow  # a spawned process imports torch and lerobot again
 def test_a_data_loader_with_workers_serves_the_same(root: Path, tmp_path: Path) -> None:
     theirs = load(root, delta_timestamps=WINDOWS)
     ours = DecodedFramesDataset(theirs, cache=tmp_path)

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -16,6 +17,8 @@ from tests.evaluation.evaluation_bench import bench as bench
 from tests.evaluation.resolved import evaluate, make_plan, results_config
 from tests.waiting import is_alive, wait_until
 from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
+from vla_eval.evaluation import plan as plans
+from vla_eval.evaluation import server_phases
 from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.records import EpisodeRecord
@@ -160,6 +163,31 @@ def test_a_network_is_compiled_in_the_thread_that_asks_it_and_tables_say_how_far
     (note,) = notes
     assert f"The network of night was compiled (float32, {n_rows} in a pass)" in note
     assert "of at most 0.9, differ by at most 0.002" in note
+
+
+def test_only_a_policy_that_takes_it_is_asked_to_compile(
+    network: Bench, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In an evaluation with `compile`, a policy of another package may be shared, too."""
+    asked: list[bool] = []
+
+    class Servers:
+        def __init__(self, options: Any, **_: Any) -> None:
+            asked.append(options.compile)
+            raise InterruptedError
+
+    monkeypatch.setattr("vla_eval.serving.shared.SharedServers", Servers)
+    resolved = resolve(network.config(inference="shared"))
+    resolved = replace(resolved, config=replace(resolved.config, compile=True))
+    plan = plans.make_plan(resolved)
+    (phase,) = server_phases.phases(plan)
+    with (
+        pytest.raises(InterruptedError),
+        server_phases.with_servers(phase, resolved, plan, logs=network.folder, stops=lambda: False),
+    ):
+        pass
+
+    assert asked == [False]
 
 
 def test_a_policy_that_cannot_be_made_ends_the_run_with_its_cause(network: Bench) -> None:

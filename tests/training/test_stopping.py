@@ -92,7 +92,7 @@ def test_processes_that_load_samples_outlive_ctrl_c(
         original(run_seed, step, process)
 
     monkeypatch.setattr(loop, "seed_step", interrupt)
-    # They are told alike however they are started; ours import torch and lerobot anew.
+    # A forked process gets the signal as ours do, which import torch and lerobot first.
     monkeypatch.setattr(loop, "child_context", lambda: multiprocessing.get_context("fork"))
     assert finetune(act(recorded, tmp_path / "run", num_workers=1)).is_finished
     assert set(interrupted) >= {0, 1, 2}

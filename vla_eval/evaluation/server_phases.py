@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from vla_eval.checkpoints.notes import COMPILE
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of
 from vla_eval.errors import RemoteConnectionError, RemoteReplyError, RemoteTimeoutError, RunChangedError
@@ -74,7 +75,9 @@ def with_servers(
 
     config = resolved.config
     options = HostOptions(
-        policy=plan.shared[phase.policy], max_batch=config.inference_max_batch, compile=config.compile
+        policy=plan.shared[phase.policy],
+        max_batch=config.inference_max_batch,
+        compile=bool(phase.jobs[0].group.args.get(COMPILE)),
     )
     adapters = [job.group.adapter for job in phase.jobs[:1]]
     with SharedServers(
