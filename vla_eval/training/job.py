@@ -87,14 +87,12 @@ class TrainingJob:
     @property
     def reward(self) -> RewardKind | None:
         """Which rewards the policy is trained on; None: it reads none."""
-        kind: RewardKind | None = getattr(self.policy, "reward", None)
-        return kind
+        return getattr(self.policy, "reward", None)
 
     @property
     def sample_memory(self) -> SampleMemory | None:
         """What a sample has in addition to its own frame, see `RememberedFramesDataset`; None: nothing."""
-        memory: SampleMemory | None = getattr(self.policy, "sample_memory", None)
-        return memory
+        return getattr(self.policy, "sample_memory", None)
 
     @property
     def facts(self) -> TrainingFacts:

@@ -140,8 +140,7 @@ def _numbered(unusual: Mask, hues: NDArray[np.int64]) -> NDArray[np.int64]:
     pieces, _ = ndimage.label(unusual)
     rows, columns = ndimage.distance_transform_edt(cores == 0, return_distances=False, return_indices=True)
     same_piece = unusual & (pieces == pieces[rows, columns])
-    numbers: NDArray[np.int64] = np.where(same_piece, cores[rows, columns], 0)
-    return numbers
+    return np.where(same_piece, cores[rows, columns], 0)
 
 
 def _bright_color(pixels: Bytes) -> Color:

@@ -76,8 +76,7 @@ def _chosen(has_frame: Tensor, after: Tensor, before: Tensor) -> Tensor:
 
 def _like(memory: Memory, parts: Sequence[Tensor]) -> Memory:
     make = getattr(type(memory), "_make", tuple)  # of named tuples
-    made: Memory = make(parts)
-    return made
+    return make(parts)
 
 
 def _check(memory: Any, expected: Memory, n_rows: int, *, where: str) -> None:

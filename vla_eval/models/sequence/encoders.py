@@ -102,8 +102,7 @@ class Keypoints(nn.Module):
 
     def forward(self, images: Tensor) -> Tensor:
         """Return (N, outputs) of images (N, 3, H, W) in [-1, 1]."""
-        read: Tensor = self.reads_out(self.features(images))
-        return read
+        return self.reads_out(self.features(images))
 
     @in_float32
     def reads_out(self, features: Tensor) -> Tensor:

@@ -48,8 +48,7 @@ class GruGate(nn.Module):
         more_reset, more_update = self.of_stream(stream).chunk(2, dim=-1)
         opened = (update + more_update - self.bias).sigmoid()
         kept = (reset + more_reset).sigmoid() * stream
-        gated: Tensor = torch.lerp(stream, (candidate + self.of_reset_stream(kept)).tanh(), opened)
-        return gated
+        return torch.lerp(stream, (candidate + self.of_reset_stream(kept)).tanh(), opened)
 
 
 class Layer(nn.Module):

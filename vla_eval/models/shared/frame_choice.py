@@ -93,8 +93,7 @@ def _means(image: NDArray[np.int64], n_blocks: int) -> Values:
     rows, columns = ((np.arange(n_blocks) * size) // n_blocks for size in (height, width))
     sums = np.add.reduceat(np.add.reduceat(image, rows, axis=1), columns, axis=2)
     n_pixels = np.outer(np.diff(rows, append=height), np.diff(columns, append=width))
-    means: Values = sums / (n_pixels * MAX_LEVEL)
-    return means
+    return sums / (n_pixels * MAX_LEVEL)
 
 
 def novelty(before: Blocks, after: Blocks) -> float:

@@ -34,5 +34,4 @@ def autocast(config: Any) -> AbstractContextManager[None]:
     if not config.use_amp:
         return nullcontext()
     device = str(config.device)
-    context: AbstractContextManager[None] = torch.autocast(torch.device(device).type, amp_dtype(device))
-    return context
+    return torch.autocast(torch.device(device).type, amp_dtype(device))
