@@ -16,11 +16,6 @@ def test_the_return_to_go_is_the_sum_of_this_reward_and_those_after_it() -> None
     assert returns_to_go(rewards).tolist() == [[7.0, 6.0, 4.0], [1.0, 1.0, 1.0]]
 
 
-def test_a_discount_counts_what_comes_later_for_less() -> None:
-    # 1 + 2/2 + 4/4; 2 + 4/2; 4
-    assert returns_to_go(torch.tensor([[1.0, 2.0, 4.0]]), discount=0.5).tolist() == [[3.0, 4.0, 4.0]]
-
-
 def test_padding_has_no_reward() -> None:
     # Before an episode's beginning lerobot repeats its first row.
     batch = {**SPARSE, "next.reward": torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0]])}

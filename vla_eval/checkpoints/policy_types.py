@@ -7,7 +7,7 @@ from vla_eval.models.families import family_of
 
 
 def asked_for_steps(kind: str | None) -> bool:
-    """Whether policies of a type are asked for one action at a time, see `select_step.py`."""
+    """Whether policies of a type are asked for one action at a time, see `select_step`."""
     return bool(family_of(str(kind)).queues)
 
 

@@ -31,7 +31,8 @@ TOKENIZER_STEP, ACTION_TOKENIZER_STEP = "tokenizer_processor", "action_tokenizer
 def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tuple[Any, Any]:
     """Return pre- and post-processor as a checkpoint describes them; `tokenizer`: instead of its own."""
     register_steps(type(config))
-    before, after = (step_names(folder / name) for name in (PREPROCESSOR_FILE, POSTPROCESSOR_FILE))
+    files = (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)
+    before, after = (read_saved_processor(folder / name).names() for name in files)
     overrides: dict[str, dict[str, Any]] = {}
     if "device_processor" in before:
         overrides["device_processor"] = {"device": config.device}
@@ -104,11 +105,6 @@ def _tokenizer(folder: Path, named: str | None) -> str | None:
         if own.is_dir():
             return str(own)
     return None
-
-
-def step_names(path: Path) -> tuple[str, ...]:
-    """Return what lerobot addresses the steps of a saved processor by."""
-    return read_saved_processor(path).names()
 
 
 def save_tokenizers(preprocessor: Any, folder: Path) -> None:

@@ -16,9 +16,9 @@ from vla_eval.checkpoints.loading import (
     read_config,
 )
 from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, history, noise_shape
-from vla_eval.checkpoints.select_step import select_step
 from vla_eval.errors import CheckpointError, InvalidActionError
 from vla_eval.models.episodes.memory import remembers_singly
+from vla_eval.models.episodes.running import select_step
 from vla_eval.models.shared.earlier_frames import mask_field
 from vla_eval.models.weights.exact import check_fit
 from vla_eval.models.weights.file import WeightFile

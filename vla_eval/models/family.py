@@ -70,7 +70,7 @@ class Family:
     replaces: Mapping[str, str] = field(default_factory=dict)
     draws_nothing: bool = False  # it draws nothing at inference
     # what `reset` empties, of a type whose `predict_action_chunk` reads the frames that its own
-    # `select_action` collected. It is asked for one action at a time (`checkpoints.select_step`).
+    # `select_action` collected. It is asked for one action at a time (`select_step`).
     queues: tuple[str, ...] = ()
     # why it can be asked neither for a chunk nor for a step of one of several episodes
     why_not: str = ""

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
-from lerobot.configs import FeatureType, PolicyFeature
-
 from vla_eval.checkpoints.bases import how_to_get
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.checkpoints.loading import NO_DOWNLOADS, config_class
@@ -14,8 +12,9 @@ from vla_eval.checkpoints.plain_errors import plain_errors
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
 from vla_eval.data.opening import OpenDataset
 from vla_eval.errors import CheckpointError
-from vla_eval.features import ACTION_KEY, ACTION_NAMES, CAMERA_KEYS, IMAGE_SHAPE, STATE_KEY
+from vla_eval.features import CAMERA_KEYS, IMAGE_SHAPE
 from vla_eval.models.families import bases
+from vla_eval.models.shared.original import with_features
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.cost.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.dataset import chosen_episodes, training_dataset
@@ -37,13 +36,9 @@ def assumed_config(recipe: FinetuneRecipe) -> Any:
     if "action_grid" in known:
         data["action_grid"] = "uniform"
     policy = decoded_policy(cls, data, recipe.type)
-    height, width, n_colors = IMAGE_SHAPE
-    image = PolicyFeature(type=FeatureType.VISUAL, shape=(n_colors, height, width))
-    fields = {recipe.rename_cameras.get(name, name): image for name in CAMERA_KEYS.values()}
-    if getattr(policy, "reads_state", True):
-        fields[STATE_KEY] = PolicyFeature(type=FeatureType.STATE, shape=(EEF_NUMBERS,))
-    policy.input_features = fields
-    policy.output_features = {ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(ACTION_NAMES),))}
+    height, width, _ = IMAGE_SHAPE
+    cameras = {recipe.rename_cameras.get(name, name): (height, width) for name in CAMERA_KEYS.values()}
+    with_features(policy, cameras, state=EEF_NUMBERS if getattr(policy, "reads_state", True) else 0)
     if hasattr(policy, "fit_to_actions"):
         policy.fit_to_actions(None, {})  # a uniform grid needs neither
     return policy

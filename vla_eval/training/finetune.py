@@ -26,14 +26,13 @@ from vla_eval.training.extension import check_steps
 from vla_eval.training.held_out import METRIC_KEY, HeldOut, asked_warnings, shared_seeds_warning
 from vla_eval.training.job import TrainingJob, training_job
 from vla_eval.training.loop import Listeners, train
-from vla_eval.training.metrics import append_metrics
 from vla_eval.training.policy_config import masks_padding
 from vla_eval.training.request import FinetuneSummary, compared_fields, request_sha256
 from vla_eval.training.run_folder import (
     LOG_FILE,
-    METRICS_FILE,
     REQUEST_KEY,
     RUN_FILE,
+    append_metrics,
     newest_step,
     open_folder,
     read_metrics,
@@ -170,7 +169,7 @@ def _held_out(job: TrainingJob, say: Say, tracked: Services, is_stopping: IsStop
         return None
 
     def report(line: Mapping[str, float | str]) -> None:
-        append_metrics(job.out / METRICS_FILE, line)
+        append_metrics(job.out, line)
         tracked.log(line, METRIC_KEY)
 
     return HeldOut(

@@ -29,6 +29,7 @@ from lerobot.datasets import EpisodeAwareSampler
 from lerobot.datasets.factory import make_dataset
 from lerobot.optim.factory import make_optimizer_and_scheduler
 from lerobot.utils.collate import lerobot_collate_fn
+from lerobot.utils.logging_utils import AverageMeter, MetricsTracker
 from lerobot.utils.random_utils import set_seed
 from lerobot.utils.utils import has_method, init_logging
 from tqdm import tqdm
@@ -43,15 +44,19 @@ from vla_eval.policies.lerobot.device import amp_dtype
 from vla_eval.training.batches import SeededSamples, Sharing, StepBatches, on_device, preprocessed
 from vla_eval.training.checkpoints import load_loss_scale, load_state, write_checkpoint
 from vla_eval.training.job import TrainingJob, lerobot_config
-from vla_eval.training.metrics import append_metrics, new_tracker, next_line
 from vla_eval.training.micro_batches import add_gradient
 from vla_eval.training.model import local_files_only, make_model, make_processors
-from vla_eval.training.run_folder import LOG_FILE, METRICS_FILE, drop_extra_checkpoints
+from vla_eval.training.run_folder import LOG_FILE, append_metrics, drop_extra_checkpoints
 from vla_eval.workers.start import child_context
 
 LAUNCHED_PRECISION = "ACCELERATE_MIXED_PRECISION"  # set by `accelerate launch --mixed_precision=…`
 LAUNCHED = {"bf16": torch.bfloat16, "fp16": torch.float16}
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+REDUCTIONS = {
+    **{"loss": "mean", "grad_norm": "none", "lr": "none", "update_s": "max", "dataloading_s": "max"},
+    **{"samples_per_s": "none", "gpu_mem_gb": "max"},
+}
+"""What is measured -> how the numbers of several processes become one; those of a policy's own are means."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +105,7 @@ def train(job: TrainingJob, listeners: Listeners) -> bool:
             if step % recipe.log_every_steps == 0:
                 line = next_line(training.tracker, recipe.batch_size * accelerator.num_processes)
                 if is_main:
-                    _report(line, job.out / METRICS_FILE, listeners)
+                    _report(line, job.out, listeners)
             is_saved = step % recipe.save_every_steps == 0 or step == recipe.steps
             if is_saved:
                 _save(training, step, listeners)
@@ -281,9 +286,33 @@ def _leave_signals_to_the_parent(_worker: int) -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
-def _report(line: Mapping[str, float], file: Path, listeners: Listeners) -> None:
+def new_tracker(job: TrainingJob, dataset: Any, accelerator: Accelerator) -> Any:
+    """Return lerobot's tracker, at the job's first step."""
+    measured = dict(REDUCTIONS)
+    if not torch.cuda.is_available():
+        del measured["gpu_mem_gb"]
+    return MetricsTracker(
+        job.recipe.batch_size,
+        dataset.num_episodes if job.whole_episodes else dataset.num_frames,  # samples of an epoch
+        dataset.num_episodes,
+        {name: AverageMeter(name, ":.3g", reduction) for name, reduction in measured.items()},
+        initial_step=job.first_step,
+        accelerator=accelerator,
+    )
+
+
+def next_line(tracker: Any, samples_per_step: int) -> dict[str, float]:
+    """Return the means since the last line, and begin new ones; every process has to take part."""
+    tracker.reduce_across_ranks()
+    tracker.samples_per_s = samples_per_step / (tracker.update_s.avg + tracker.dataloading_s.avg)
+    values = tracker.to_dict()
+    tracker.reset_averages()
+    return {"step": values.pop("steps"), **{name: float(value) for name, value in values.items()}}
+
+
+def _report(line: Mapping[str, float], out: Path, listeners: Listeners) -> None:
     logging.info(line)
-    append_metrics(file, line)
+    append_metrics(out, line)
     listeners.on_metrics(line)
     if not math.isfinite(line["loss"]):
         raise TrainingError(

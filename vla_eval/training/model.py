@@ -17,7 +17,8 @@ from vla_eval.checkpoints.files import POSTPROCESSOR_FILE, PREPROCESSOR_FILE
 from vla_eval.checkpoints.foreign_code import no_foreign_code
 from vla_eval.checkpoints.loading import LoadOptions, begin_from, config_class, fill_policy
 from vla_eval.checkpoints.plain_errors import plain_errors, raise_plainly
-from vla_eval.checkpoints.processors import step_names, tokenizer_overrides
+from vla_eval.checkpoints.processors import tokenizer_overrides
+from vla_eval.checkpoints.saved_processor import read_saved_processor
 from vla_eval.data.exact_statistics import usable_statistics
 from vla_eval.errors import RecipeError, TrainingError
 from vla_eval.models.families import family_of
@@ -116,10 +117,10 @@ def _overrides(job: TrainingJob, config: Any, folder: Path, stats: Any) -> dict[
             "action_names": getattr(job.policy, "action_feature_names", None),
         }
         after["absolute_actions_processor"] = {"enabled": True}
-    steps = step_names(folder / PREPROCESSOR_FILE)
+    steps = read_saved_processor(folder / PREPROCESSOR_FILE).names()
     before |= tokenizer_overrides(folder, job.policy, steps, tokenizer=job.recipe.tokenizer)
     _address_ours(before, steps, "normalizer_processor", ENCODER_STEP, job.policy)
-    steps = step_names(folder / POSTPROCESSOR_FILE)
+    steps = read_saved_processor(folder / POSTPROCESSOR_FILE).names()
     _address_ours(after, steps, "unnormalizer_processor", DECODER_STEP, job.policy)
     return {"preprocessor_overrides": before, "postprocessor_overrides": after}
 

@@ -163,6 +163,12 @@ def read_metrics(path: Path) -> Iterator[dict[str, Any]]:
         yield values
 
 
+def append_metrics(path: Path, line: Mapping[str, float | str]) -> None:
+    """Write one line of metrics in a run folder."""
+    with (path / METRICS_FILE).open("a", encoding="utf-8") as lines:
+        lines.write(f"{json.dumps(dict(line))}\n")
+
+
 def point(link: Path, target: str) -> None:
     """Let the link name the target, without a moment at which there is no link.
 

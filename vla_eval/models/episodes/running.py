@@ -1,16 +1,18 @@
 """What a LeRobot policy is given of running episodes: frames in time, seeds, noise, a row of a pass."""
 
+import copy
 import zlib
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any  # lerobot is untyped
+from typing import Any, NamedTuple  # lerobot is untyped
 
 import torch
 from torch import Tensor
 
 from vla_eval.core import EpisodeStart
 from vla_eval.errors import InvalidActionError
+from vla_eval.models.families import family_of
 from vla_eval.models.shared.earlier_frames import FrameMemory
 from vla_eval.seeding import Stream, generator
 
@@ -91,6 +93,26 @@ def given_noise(seeds: Iterable[int], shape: tuple[int, int]) -> Tensor:
 def frames_in_time(frames: Sequence[Frame]) -> dict[str, Tensor]:
     """Return frames (…) as one of (T, …)."""
     return {key: torch.stack([frame[key] for frame in frames]) for key in frames[0]}
+
+
+class Step(NamedTuple):
+    """A chunk (B, 1, D) of one action, and the policy's queues after it."""
+
+    action: Tensor
+    queues: Mapping[str, Any]
+
+
+def select_step(policy: Any, batch: dict[str, Any], queues: Mapping[str, Any] | None) -> Step:
+    """Return the next action for the newest frame (B, …); `queues` stay as they are; None: it begins.
+
+    Each episode has its own instance of the queues that a policy of such a type keeps.
+    """
+    owner = policy.select_action.__self__  # of a policy with a LoRA adapter, not what is around it
+    for name, value in (queues or {}).items():
+        setattr(owner, name, copy.deepcopy(value))
+    action: Tensor = owner.select_action(batch)
+    kept = {name: getattr(owner, name) for name in family_of(owner.config.type).queues}
+    return Step(action.unsqueeze(1), kept)
 
 
 def batch_of(frames: Sequence[Frame], episodes: Iterable[Episode]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.models.episodes.color_objects import changed_things
 from vla_eval.models.episodes.config import SPACE, EpisodeConfig
 from vla_eval.models.shared.levels import in_bytes, in_numbers
+from vla_eval.models.shared.ported_config import PortedConfig
 
 LEAST_VARIANCE_M2 = 1e-6
 LEAST_WEIGHT = 1e-12
@@ -49,7 +50,7 @@ def last_of(chosen: Tensor) -> Tensor:
     return chosen.flatten().cumsum(dim=0).sub(1).reshape(chosen.shape)
 
 
-def stacked_images(batch: dict[str, Tensor], config: EpisodeConfig) -> Tensor:
+def stacked_images(batch: dict[str, Tensor], config: PortedConfig) -> Tensor:
     """Return the images (…, cameras, 3, H, W), in the order of the configuration."""
     return torch.stack([batch[key] for key in config.image_features], dim=-4)
 

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from vla_eval.errors import MissingInstructionError
-from vla_eval.models.shared.tokens_read import Heard, note
+from vla_eval.models.shared.sentence_reading import SentenceReading
+from vla_eval.models.shared.tokens_read import note
 
 TASK_KEY = "task"  # of a batch: one sentence per episode
 ROWS = 4096  # of the table; some fifty words of our tasks' sentences have one each, which a test checks
@@ -31,7 +32,8 @@ class SentenceEncoder(nn.Module):
         rows = [word_rows(sentence) for sentence in sentences]
         for sentence, own in zip(sentences, rows, strict=True):
             kept = " ".join(sorted(WORD.findall(sentence.lower())))
-            note(Heard(text=sentence, ids=tuple(sorted(own)), n_tokens=len(own), limit=None, kept=kept))
+            ids = tuple(sorted(own))
+            note(SentenceReading(sentence=sentence, ids=ids, n_tokens=len(own), limit=None, kept=kept))
         device = self.words.weight.device
         words = torch.tensor([row for own in rows for row in own], device=device)
         begins = torch.tensor([0, *accumulate(len(own) for own in rows[:-1])], device=device)

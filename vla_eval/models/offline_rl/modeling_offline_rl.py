@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from vla_eval.features import ACTION_KEY, DONE_KEY, REWARD_KEY
+from vla_eval.models.episodes.samples import stacked_images
 from vla_eval.models.offline_rl.configuration_offline_rl import TYPE, MikasaOfflineRLConfig
 from vla_eval.models.offline_rl.losses import (
     advantage_weights,
@@ -148,7 +149,7 @@ class MikasaOfflineRLPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot 
     def predict_action_chunk(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
         """Return (B, 1, action) for one frame per episode."""
         self.eval()
-        return self.network.act(self.network.encode(self._images(batch)))[:, None]
+        return self.network.act(self.network.encode(stacked_images(batch, self.config)))[:, None]
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Tensor], **kwargs: Any) -> Tensor:
@@ -157,7 +158,7 @@ class MikasaOfflineRLPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot 
 
     def _transitions(self, batch: dict[str, Tensor]) -> Transitions:
         """Return the batch in the order in which it happened; an episode's last frame has none behind it."""
-        images = self._images(batch)
+        images = stacked_images(batch, self.config)
         with torch.no_grad():
             later = self.network.encode(images[:, 1])
         actions = batch[ACTION_KEY][:, 0]
@@ -184,6 +185,3 @@ class MikasaOfflineRLPolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot 
                 "policy.reward=dense."
             )
         return rewards
-
-    def _images(self, batch: dict[str, Tensor]) -> Tensor:
-        return torch.stack([batch[key] for key in self.config.image_features], dim=-4)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.sequence.core import CoreMemory
+from vla_eval.models.sequence.core import CoreMemory, Segmented
 from vla_eval.models.sequence.relative_attention import (
     RelativeAttention,
     RelativeBiases,
@@ -23,7 +23,6 @@ from vla_eval.models.sequence.relative_attention import (
     distances_of,
     sinusoids,
 )
-from vla_eval.models.sequence.segments import Segmented
 from vla_eval.models.sequence.sizes import ElmurOptions
 
 NORM_EPS = 1e-8  # of the source's norms

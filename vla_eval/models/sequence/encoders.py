@@ -118,7 +118,7 @@ class Cameras(nn.ModuleList):
     """The images of all cameras as one vector: an encoder for each, or one whose channels they all are."""
 
     def __init__(self, name: str, *, n_cameras: int, image_px: int, outputs: int) -> None:
-        channels = RGB * n_cameras if ENCODERS[name].shared else RGB
+        channels = RGB * n_cameras if ENCODERS[name] else RGB
         n_encoders = RGB * n_cameras // channels
         self.outputs = n_encoders * outputs
         make: Callable[..., nn.Module] = (

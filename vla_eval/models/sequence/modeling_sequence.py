@@ -230,9 +230,7 @@ def rewards_in(batch: Mapping[str, Tensor], kind: RewardKind) -> Tensor:
     return rewards
 
 
-def returns_to_go(rewards: Tensor, *, discount: float = 1.0) -> Tensor:
-    """Return discounted sums of rewards (B, T) from each step on (Chen et al. 2021, section 3)."""
-    steps = torch.arange(rewards.shape[1], device=rewards.device)
-    lag = steps[None, :] - steps[:, None]
-    weights = torch.where(lag >= 0, discount ** lag.clamp(min=0).float(), 0.0)
-    return rewards @ weights.T
+def returns_to_go(rewards: Tensor) -> Tensor:
+    """Return sums of rewards (B, T) from each step on (Chen et al. 2021, section 3)."""
+    n_steps = rewards.shape[1]
+    return rewards @ torch.ones(n_steps, n_steps, device=rewards.device).triu().T

@@ -138,19 +138,8 @@ def options_of(core: str, given: Mapping[str, Any]) -> CoreOptions:
     return decode(type(row.options), {**asdict(row.options), **given}, where=where)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class EncoderRow:
-    """An image encoder: `shared` by all cameras, whose images are its channels, or one for each."""
-
-    shared: bool = False
-
-
-ENCODERS = {
-    "keypoints": EncoderRow(),
-    "color_keypoints": EncoderRow(),
-    "nature": EncoderRow(),
-    "nature_stacked": EncoderRow(shared=True),
-}
+ENCODERS = {"keypoints": False, "color_keypoints": False, "nature": False, "nature_stacked": True}
+"""Name -> whether one is shared by all cameras, whose images are its channels."""
 NATURE_LAYERS = ((8, 4), (4, 2), (3, 1))
 """Kernel and stride of the convolutions of `nature`, in pixels: Mnih et al. 2015."""
 

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.sequence.core import CoreMemory
+from vla_eval.models.sequence.core import CoreMemory, Segmented
 from vla_eval.models.sequence.relative_attention import (
     RelativeAttention,
     RelativeBiases,
@@ -26,7 +26,6 @@ from vla_eval.models.sequence.relative_attention import (
     distances_of,
     sinusoids,
 )
-from vla_eval.models.sequence.segments import Segmented
 from vla_eval.models.sequence.sizes import TransformerXLOptions
 
 

@@ -3,7 +3,8 @@
 import contextlib
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple  # transformers is untyped here
+from dataclasses import replace
+from typing import Any  # transformers is untyped here
 from unittest.mock import patch
 
 from vla_eval.models.shared.sentence_reading import SentenceReading
@@ -12,23 +13,13 @@ MAX_SENTENCES = 4096  # of which something is kept; a client may ask with anothe
 NO_LIMIT = 1 << 20  # transformers' tokenizers say a number beyond it if they have none
 
 
-class Heard(NamedTuple):
-    """A text that was made tokens of; see `SentenceReading`."""
-
-    text: str
-    ids: tuple[int, ...]
-    n_tokens: int
-    limit: int | None
-    kept: str
+_listeners: list[list[SentenceReading]] = []
 
 
-_listeners: list[list[Heard]] = []
-
-
-def note(heard: Heard) -> None:
+def note(reading: SentenceReading) -> None:
     """Tell the listeners, if any, what was read of a text."""
     for listener in _listeners:
-        listener.append(heard)
+        listener.append(reading)
 
 
 class Readings:
@@ -50,13 +41,11 @@ class Readings:
         self._asked.update(asked)
         plain = {sentence: _plain(sentence) for sentence in sorted(asked, key=len, reverse=True)}
         for one in heard:
-            text = _plain(one.text)
+            text = _plain(one.sentence)  # with whatever the policy puts around it
             # The longest, since one sentence may be the beginning of another.
             sentence = next((sentence for sentence, words in plain.items() if words in text), None)
             if sentence is not None and sentence not in self.known:
-                self.known[sentence] = SentenceReading(
-                    sentence=sentence, ids=one.ids, n_tokens=one.n_tokens, limit=one.limit, kept=one.kept
-                )
+                self.known[sentence] = replace(one, sentence=sentence)
 
 
 def _plain(text: str) -> str:
@@ -65,8 +54,8 @@ def _plain(text: str) -> str:
 
 
 @contextlib.contextmanager
-def _listening() -> Iterator[list[Heard]]:
-    heard: list[Heard] = []
+def _listening() -> Iterator[list[SentenceReading]]:
+    heard: list[SentenceReading] = []
     _listeners.append(heard)
     try:
         with _tokenizers_noted():
@@ -97,7 +86,7 @@ def _tokenizers_noted() -> Iterator[None]:
         yield
 
 
-def _heard(tokenizer: Any, original: Any, text: str, settings: Mapping[str, Any]) -> Heard:
+def _heard(tokenizer: Any, original: Any, text: str, settings: Mapping[str, Any]) -> SentenceReading:
     """Return what a tokenizer makes of a text with and without its limit."""
     asked = {"add_special_tokens": settings.get("add_special_tokens", True), "padding": False}
     whole = original(tokenizer, text, truncation=False, verbose=False, **asked)["input_ids"]
@@ -106,8 +95,8 @@ def _heard(tokenizer: Any, original: Any, text: str, settings: Mapping[str, Any]
         limit = settings.get("max_length") or tokenizer.model_max_length
         if len(whole) > limit:
             kept = original(tokenizer, text, truncation=how, max_length=limit, **asked)["input_ids"]
-    return Heard(
-        text=text,
+    return SentenceReading(
+        sentence=text,
         ids=tuple(int(one) for one in kept),
         n_tokens=len(whole),
         limit=limit if limit is not None and limit < NO_LIMIT else None,

@@ -82,17 +82,6 @@ class BallPolicy(ScriptedPolicy):
         return ActionChunk(actions=expert.plan(state, window.last.step, self._n_actions))
 
 
-def make_random(context: PolicyContext) -> RandomPolicy:
-    """Make the `random` control."""
-    return RandomPolicy(context)
-
-
-@in_any_control_mode
-def make_hold(context: PolicyContext) -> ScriptedPolicy:
-    """Make the `hold` control."""
-    return HoldPolicy(context)
-
-
 def _maker(mode: Mode, does: str = "") -> Callable[[PolicyContext], ScriptedPolicy | TranslatedPolicy]:
     """Return what makes a control of the expert; one that `does` something with candidates needs some."""
 
@@ -108,6 +97,8 @@ def _maker(mode: Mode, does: str = "") -> Callable[[PolicyContext], ScriptedPoli
     return in_any_control_mode(make)
 
 
+make_random = RandomPolicy
+make_hold = in_any_control_mode(HoldPolicy)
 make_oracle = _maker("oracle")
 """Makes the `oracle` for the task of the context."""
 make_cue_blind = _maker("cue_blind")

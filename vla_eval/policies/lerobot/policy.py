@@ -1,7 +1,7 @@
 """Run any LeRobot policy in our loop: frames in, whole chunks out; see docs/lerobot_policies.md.
 
 The policy's own queues are not used, and the frames of an episode are kept here, per slot, at control rate.
-Types that collect their frames themselves are asked for one action per step (`checkpoints.select_step`).
+Types that collect their frames themselves are asked for one action per step (`select_step`).
 """
 
 from collections import Counter
@@ -19,13 +19,20 @@ from vla_eval.checkpoints.files import read_facts
 from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpoint
 from vla_eval.checkpoints.plain_errors import plain_errors
 from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, history, noise_shape
-from vla_eval.checkpoints.select_step import select_step
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import InvalidActionError, SpecMismatchError
 from vla_eval.features import CAMERA_KEYS, PROPRIO_STATES, StateKind
 from vla_eval.models.episodes.memory import memory_of, recall, remembers, remembers_in_rows, remembers_singly
-from vla_eval.models.episodes.running import Episode, Frame, batch_of, frames_in_time, given_noise, in_rows
+from vla_eval.models.episodes.running import (
+    Episode,
+    Frame,
+    batch_of,
+    frames_in_time,
+    given_noise,
+    in_rows,
+    select_step,
+)
 from vla_eval.models.families import family_of
 from vla_eval.models.shared.earlier_frames import FrameMemory
 from vla_eval.models.shared.sentence_reading import SentenceReading
