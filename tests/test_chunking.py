@@ -18,7 +18,7 @@ def executed(spec: ChunkingSpec, *, size: int, n_steps: int) -> list[float | Non
     executor = ChunkExecutor(spec)
     actions: list[float | None] = []
     for step in range(n_steps):
-        if executor.infers_at(step):
+        if step == executor.next_inference_step:
             executor.submit(step, chunk(step, size))
         action = executor.action(step)
         actions.append(None if action is None else float(action[0]))
@@ -40,7 +40,7 @@ def test_inferences_come_every_n_action_steps() -> None:
     executor = ChunkExecutor(ChunkingSpec(n_action_steps=3))
     inferred_at = []
     for step in range(8):
-        if executor.infers_at(step):
+        if step == executor.next_inference_step:
             inferred_at.append(step)
             executor.submit(step, chunk(step, 3))
 
@@ -98,16 +98,6 @@ def test_the_ensemble_respects_the_interval_and_the_delay() -> None:
     assert executed(spec, size=4, n_steps=4) == [None, 1, 2, 102]
 
 
-def test_reset_forgets_all_chunks() -> None:
-    executor = ChunkExecutor(ChunkingSpec(n_action_steps=2))
-    executor.submit(0, chunk(0, 2))
-
-    executor.reset()
-
-    assert executor.infers_at(0)
-    assert executor.action(0) is None
-
-
 def test_executed_actions_are_no_views_of_the_policy_s_array() -> None:
     given = chunk(0, 2)
     executor = ChunkExecutor(ChunkingSpec(n_action_steps=2))
@@ -128,10 +118,7 @@ def test_the_first_inference_may_be_late_and_all_others_follow_it_by_n_action_st
 
     # Nothing to execute at steps 0 and 1; chunks at steps 2 and 5.
     assert executed(spec, size=3, n_steps=7) == [None, None, 200, 201, 202, 500, 501]
-    executor = ChunkExecutor(spec)
-    executor.submit(2, chunk(2, 3))
-    executor.reset()
-    assert executor.next_inference_step == 2
+    assert ChunkExecutor(spec).next_inference_step == 2
 
 
 def test_a_first_inference_that_repeats_an_earlier_rhythm_is_refused() -> None:

@@ -95,33 +95,20 @@ class _Arrived(NamedTuple):
 
 
 class ChunkExecutor:
-    """Executes the chunks of one episode; one object per slot, emptied by `reset`."""
+    """Executes the chunks of one episode."""
 
     def __init__(self, spec: ChunkingSpec) -> None:
         self.spec = spec
-        self._chunks: list[_Arrived] = []
-        self._next_inference_step = spec.first_inference_step
-
-    def reset(self) -> None:
-        """Forget all chunks: a new episode begins at step 0."""
-        self._chunks = []
-        self._next_inference_step = self.spec.first_inference_step
-
-    @property
-    def next_inference_step(self) -> int:
+        self.next_inference_step = spec.first_inference_step
         """The step whose observation is to be given to the policy next."""
-        return self._next_inference_step
-
-    def infers_at(self, step: int) -> bool:
-        """Whether the observation at this step is to be given to the policy."""
-        return step == self._next_inference_step
+        self._chunks: list[_Arrived] = []
 
     def submit(self, step: int, chunk: ActionChunk) -> None:
         """Take the chunk that was inferred from the observation at `step`."""
         spec = self.spec
         arrival = step + spec.delay_steps
         self._chunks.append(_Arrived(arrival - spec.n_skipped, arrival, chunk.actions.copy()))
-        self._next_inference_step = step + spec.n_action_steps
+        self.next_inference_step = step + spec.n_action_steps
 
     def action(self, step: int) -> FloatArray | None:
         """Return the (A,) action to execute at `step`, or None while no chunk has arrived yet."""

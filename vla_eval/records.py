@@ -139,11 +139,7 @@ class EpisodeRecord:
 
     @classmethod
     def from_json(cls, line: str | bytes, *, where: str) -> Self:
-        """Read a record back.
-
-        Args:
-            line: what `to_json` wrote.
-            where: file and line number, for the message.
+        """Read back what `to_json` wrote; `where`: file and line number, for the message.
 
         Raises:
             RunFolderError: the line is not a record, one of another version, or one that cannot be true.
@@ -154,11 +150,7 @@ class EpisodeRecord:
         return cls._from_data(data, source)
 
     def check(self, *, where: str) -> None:
-        """Raise `RunFolderError` if the record would not survive a round trip.
-
-        Args:
-            where: what made it, for the message.
-        """
+        """Raise `RunFolderError` if the record, made by `where`, would not survive a round trip."""
         source = Source(where=where, what="a sound episode record", remedy=MADE_REMEDY, error=RunFolderError)
         self._from_data(asdict(self), source)
 
@@ -207,22 +199,8 @@ class EpisodeTiming:
 
 MAX_NAME = 255  # characters, as in the name of a file
 
-RESULT_FIELDS = (
-    *("success_once", "success_at_end", "success_step", "n_steps", "target", "n_candidates", "first_choice"),
-    *("first_choice_success", "n_wrong_choices", "chance_success", "episode_return", "n_inferences"),
-    *(
-        "n_frames",
-        "n_clipped_steps",
-        "trajectory_sha256",
-        "target_place",
-        "first_choice_place",
-        "tcp_reach_m",
-        "right_candidates",
-        "touched_candidates",
-        "candidate_places",
-        "final_turn_rad",
-    ),
-)
+OF_ANY_EPISODE = {*EpisodeKey._fields, "outcome", "error"}
+RESULT_FIELDS = tuple(field.name for field in fields(EpisodeRecord) if field.name not in OF_ANY_EPISODE)
 
 
 class Rule(NamedTuple):
@@ -361,10 +339,5 @@ OF_A_RESULT = (
 
 def broken_rule(record: EpisodeRecord) -> Rule | None:
     """Return the first rule that a record breaks; None if it is sound."""
-    for rule in ALWAYS:
-        if not rule.holds(record):
-            return rule
-    for rule in OF_AN_ERROR if record.outcome == "error" else OF_A_RESULT:
-        if not rule.holds(record):
-            return rule
-    return None
+    rules = (*ALWAYS, *(OF_AN_ERROR if record.outcome == "error" else OF_A_RESULT))
+    return next((rule for rule in rules if not rule.holds(record)), None)

@@ -133,7 +133,7 @@ class _Loop:
 
     def infer(self, active: Sequence[_Running]) -> None:
         """Ask the policy for a chunk for each episode that is due."""
-        due = [episode for episode in active if episode.executor.infers_at(episode.log.n_steps)]
+        due = [episode for episode in active if episode.executor.next_inference_step == episode.log.n_steps]
         if not due:
             return
         first_step = self.settings.reset_policy_at_step

@@ -76,12 +76,12 @@ def _viewer() -> str:
 def _of_run(args: argparse.Namespace) -> list[Path]:
     from vla_eval.errors import ViewingError
     from vla_eval.storage.run_folder import read_run
-    from vla_eval.viz.picking import Wish, pick
+    from vla_eval.viz.picking import pick
 
     if args.episode is not None:
         raise ViewingError(f"{args.run}: is a run; --episode is of datasets. --seed picks one of a run.")
-    wish = Wish(task=args.task, policy=args.policy, n_action_steps=args.n_action_steps, seed=args.seed)
-    return pick(read_run(args.run), wish)
+    wished = {name: getattr(args, name) for name in ("task", "policy", "n_action_steps", "seed")}
+    return pick(read_run(args.run), **wished)
 
 
 def _of_dataset(args: argparse.Namespace) -> list[Path]:

@@ -39,20 +39,15 @@ class ArmState(NamedTuple):
 
     position_m: Vector
     step_m: Vector
-    yaw_rad: float = 0.0
-    turn_rad: float = 0.0
-    width_m: float = GRIPPER_MAX_WIDTH_M
+    yaw_rad: float
+    turn_rad: float
+    width_m: float
 
 
-def arm_state(tcp_position_m: Vector, tcp_velocity_m_s: Vector) -> ArmState:
-    """Return the model's state for a measured position and velocity."""
-    return ArmState(tcp_position_m.copy(), tcp_velocity_m_s * STEP_SECONDS)
-
-
-def gripper_state(state: PrivilegedState) -> ArmState:
-    """Return the model's state, yaw and fingers included."""
-    arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
-    return arm._replace(yaw_rad=state.tcp_yaw_rad, width_m=state.gripper_width_m)
+def arm_state(state: PrivilegedState) -> ArmState:
+    """Return the model's state; how fast the wrist turns is not measured."""
+    step_m = state.tcp_velocity_m_s * STEP_SECONDS
+    return ArmState(state.tcp_position_m.copy(), step_m, state.tcp_yaw_rad, 0.0, state.gripper_width_m)
 
 
 def advance(arm: ArmState, translation: Vector) -> ArmState:
@@ -83,7 +78,7 @@ def follow(
     goal_of: Callable[[ArmState], Vector], state: PrivilegedState, n_actions: int, *, gripper: float
 ) -> NDArray[np.float32]:
     """Return (n_actions, 7) that move the arm to the point that is its goal at each step of the model."""
-    arm = arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
+    arm = arm_state(state)
     rows = []
     for _ in range(n_actions):
         translation = towards(goal_of(arm), arm)

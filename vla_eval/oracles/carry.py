@@ -53,7 +53,6 @@ class CarryExpert:
     """One episode's expert; with an imagined home it moves the cube back to that position."""
 
     def __init__(self, *, imagined_home_m: model.Vector | None) -> None:
-        """Store the position to which the cube goes back, if it is not the one observed at the start."""
         self._imagined_home_m = imagined_home_m
         self._was_there = False
         self._closing = False
@@ -63,7 +62,7 @@ class CarryExpert:
         """Return (n_actions, 7), planned from this state and earlier ones."""
         home_m = state.bodies["first_place"].position_m[:2]
         play = _Play(
-            arm=model.gripper_state(state),
+            arm=model.arm_state(state),
             cube_m=state.bodies["cube"].position_m[:2],
             goal_m=state.bodies["goal"].position_m[:2],
             home_m=home_m if self._imagined_home_m is None else self._imagined_home_m,
@@ -87,7 +86,7 @@ def plan_from_one_frame(state: PrivilegedState, n_actions: int) -> NDArray[np.fl
     The cube was dragged straight to the disc, and only until it was on it. So the way back is the line from
     the disc's centre through the cube, wherever on it the cube is. The disc's colour says which way to go.
     """
-    arm = model.gripper_state(state)
+    arm = model.arm_state(state)
     cube_m, goal_m = (state.bodies[name].position_m[:2] for name in ("cube", "goal"))
     held = arm.width_m < HELD_WIDTH_M
     stalled = held and float(np.linalg.norm(state.tcp_velocity_m_s)) < STALLED_M_S
@@ -157,14 +156,11 @@ def _advance(play: _Play, translation: model.Vector, gripper: float) -> _Play:
     return replace(play, arm=arm, cube_m=play.cube_m + moved)
 
 
-class CubeCarries:
-    """Makes the expert of an episode."""
-
-    def __call__(self, *, rng: np.random.Generator, imagined: bool) -> CarryExpert:
-        """Draw the imagined first position now, before the first observation."""
-        x, band = rng.uniform(*IMAGINED_X_M), IMAGINED_BANDS_Y_M[int(rng.integers(3))]
-        home_m = np.array([x, band + rng.uniform(0, IMAGINED_BAND_WIDTH_M)])
-        return CarryExpert(imagined_home_m=home_m if imagined else None)
+def carry_cube(*, rng: np.random.Generator, imagined: bool) -> CarryExpert:
+    """Make the expert of an episode; the imagined first position is drawn before the first observation."""
+    x, band = rng.uniform(*IMAGINED_X_M), IMAGINED_BANDS_Y_M[int(rng.integers(3))]
+    home_m = np.array([x, band + rng.uniform(0, IMAGINED_BAND_WIDTH_M)])
+    return CarryExpert(imagined_home_m=home_m if imagined else None)
 
 
-CUBE = CubeCarries()
+CUBE = carry_cube

@@ -47,7 +47,6 @@ class CatchExpert:
         nominal_speed_m_s: float,
         imagined_ball: tuple[model.Vector, model.Vector] | None,
     ) -> None:
-        """Store where to wait and what to expect, and the imagined ball if the real one must not be used."""
         self._meet_y_m = meet_y_m
         self._nominal_speed_m_s = nominal_speed_m_s
         self._imagined_ball = imagined_ball
@@ -57,7 +56,7 @@ class CatchExpert:
         """Return (n_actions, 7), planned from this state alone (and, blind, from the imagined ball)."""
         ball_m, velocity_m_s = self._ball(state, step)
         play = _Play(
-            arm=model.gripper_state(state),
+            arm=model.arm_state(state),
             ball_m=ball_m,
             ball_velocity_m_s=velocity_m_s,
             meet_y_m=self._meet_y_m,

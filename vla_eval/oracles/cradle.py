@@ -22,7 +22,9 @@ LANE_OFFSET_M = 0.065  # distance to the lane while waiting
 FOLLOW_GAP_M = 0.05
 CONTACT_GAP_M = 0.03
 MEET_Y_EXTRA_M = 0.03
+PUSH_SPEED_M_S = 0.47  # along x: the gap is closed at it, and the meeting point follows from it
 PUSH_SPEED_RANGE_M_S = (0.2, 0.6)
+MEET_Y_MIN_M = -0.5  # the arm does not wait farther back than this
 TRACK_GAIN_PER_S = 6.0
 SIDE_SPEED_CHANGE_M_S = 0.04  # per control step; a faster change lets the ball slip past a finger
 FOLLOW_LEAD_S = 0.10
@@ -41,10 +43,7 @@ class CradleTactics:
     imagined_velocity_y_m_s: tuple[float, float]
     # the rolling ball's (x, y) velocity that is assumed while it is out of view
     nominal_velocity_m_s: tuple[float, float]
-    # speed along x at which the gap is closed, and from which the meeting point follows
-    push_speed_m_s: float = 0.47
-    meet_y_min_m: float = -0.5  # the arm does not wait farther back than this
-    # nor closer to the base than this, where the inverse kinematics finds few low poses
+    # the arm does not wait closer to the base than this, where the inverse kinematics finds few low poses
     min_reach_m: float = 0.30
     # the gap is closed once ball and cradle are this close along y. An arm that is hardly faster
     # approaches so slowly that both would have passed the goal by then.
@@ -109,7 +108,6 @@ class CradleExpert:
         return np.stack(rows)
 
     def _present(self, state: PrivilegedState, step: int) -> _Play:
-        arm = model.arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
         goal = state.bodies["goal"].position_m[:2]
         if self._imagined:
             ball, velocity = self._imagined_ball(goal)
@@ -122,7 +120,7 @@ class CradleExpert:
             ball, velocity = body.position_m[:2], body.velocity_m_s[:2]
         return _Play(
             tactics=self._tactics,
-            arm=arm,
+            arm=model.arm_state(state),
             ball_m=ball,
             ball_velocity_m_s=velocity,
             goal_m=goal,
@@ -165,7 +163,7 @@ def _command(play: _Play) -> model.Vector:
         keep_gap = TRACK_GAIN_PER_S * (play.gap_m - FOLLOW_GAP_M)
         return np.array([ball_v_x + keep_gap, ball_v_y + tracking, height])
     if play.stage == "close":
-        return np.array([play.tactics.push_speed_m_s, ball_v_y + tracking, height])
+        return np.array([PUSH_SPEED_M_S, ball_v_y + tracking, height])
     forward, _ = _push_speeds_m_s(play)
     return np.array([forward, _next_side_speed_m_s(play) + tracking, height])
 
@@ -174,8 +172,8 @@ def _waiting_place_m(play: _Play) -> model.Vector:
     """Return (x, y) next to the lane from which a push carries the ball to the goal."""
     lane_x = float(play.ball_m[0])
     v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
-    run_up_y = float(play.goal_m[0] - lane_x) * v_y / play.tactics.push_speed_m_s + MEET_Y_EXTRA_M
-    meet_y = max(float(play.goal_m[1]) - run_up_y, play.tactics.meet_y_min_m)
+    run_up_y = float(play.goal_m[0] - lane_x) * v_y / PUSH_SPEED_M_S + MEET_Y_EXTRA_M
+    meet_y = max(float(play.goal_m[1]) - run_up_y, MEET_Y_MIN_M)
     x = lane_x + v_x * (meet_y - float(play.ball_m[1])) / v_y - LANE_OFFSET_M
     from_base_x = x - BASE_X_M
     min_reach_m = play.tactics.min_reach_m

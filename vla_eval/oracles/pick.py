@@ -30,7 +30,7 @@ class PickExpert:
     def plan(self, state: PrivilegedState, candidate: int, n_actions: int) -> NDArray[np.float32]:
         """Return (n_actions, 7) that lift a mug, planned from `state` alone."""
         mug, goal = state.bodies[f"mug_{candidate}"], state.bodies[f"goal_{candidate}"]
-        mug_m, arm = mug.position_m, model.gripper_state(state)
+        mug_m, arm = mug.position_m, model.arm_state(state)
         rows = []
         for _ in range(n_actions):
             near = float(np.linalg.norm(arm.position_m - mug_m)) < HOLDING_RADIUS_M

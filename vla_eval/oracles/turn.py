@@ -70,7 +70,7 @@ class TurnExpert:
         return np.stack(rows)
 
     def _present(self, state: PrivilegedState) -> _Play:
-        arm = model.gripper_state(state)
+        arm = model.arm_state(state)
         peg, goal = state.bodies["peg"], state.bodies["goal"]
         if self._goal_yaw_rad is None:
             by_rad = self._imagined_angle_rad

@@ -31,7 +31,7 @@ class LowFlight:
     ) -> NDArray[np.float32]:
         """Return (n_actions, 7) that touch the wanted candidates, `in_order` or the nearest first."""
         goals = {index: self._resting_point(state.candidate_positions_m[index]) for index in wanted}
-        arm = model.arm_state(state.tcp_position_m, state.tcp_velocity_m_s)
+        arm = model.arm_state(state)
         rows = []
         for _ in range(n_actions):
             index = _next_index(goals, arm.position_m, in_order=in_order)
