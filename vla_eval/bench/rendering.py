@@ -66,7 +66,7 @@ def run_bench(
         _episode(blind, 1, (), eager=False)
         rows = tuple(_row(env, k, repeats) for k in chunk_lengths)
         physics = min(_episode(blind, 1, (), eager=False).wall_seconds for _ in range(repeats))
-        device = dict(describe_device(env) or {})
+        device = describe_device(env)
         return BenchReport(
             task=task,
             device=device.get("render_device", "unknown"),

@@ -53,7 +53,7 @@ class SimulatorRunner[J: Job, A]:
         if self._env is None or self._env_settings != settings:
             self.close()
             self._env, self._env_settings = make_env(settings), settings
-            self._device = dict(describe_device(self._env) or {})
+            self._device = describe_device(self._env)
             if self._device and settings.cameras:
                 self._tell(DeviceFound(device=self._device))
         return self._env

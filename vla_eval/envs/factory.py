@@ -1,10 +1,10 @@
 """Make an environment from its settings: alone knows which simulators exist, imports them on first use."""
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import cast
 
-from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.config.environment import EnvSettings
 from vla_eval.core import SimEnv
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.envs.official_settings import check_official
@@ -13,8 +13,6 @@ from vla_eval.lock.switch import own_need
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import check_arguments, offered_by, robot_uid
 from vla_eval.tasks.catalog import TASKS, task_spec
-
-__all__ = ["EnvSettings", "RenderSettings", "describe_device", "describe_env", "make_env"]
 
 SIMULATORS = {"maniskill": "vla_eval.envs.maniskill:ManiSkillEnv", "fake": "vla_eval.envs.fake:FakeEnv"}
 OFFICIAL = "vla_eval.envs.official:OfficialEnv"
@@ -67,11 +65,9 @@ def describe_env(settings: EnvSettings) -> EnvSpec:
     return offered_by(task, settings.kwargs)
 
 
-def describe_device(env: SimEnv) -> Mapping[str, str] | None:
-    """Return the environment's description of its device, if it has one.
+def describe_device(env: SimEnv) -> dict[str, str]:
+    """Return the environment's `device` (name of the render device, driver …), or nothing if it has none.
 
-    An environment may have a `device` mapping (name of the render device, driver …). It is written into
-    the run folder, because images may differ between devices.
+    It is written into the run folder, because images may differ between devices.
     """
-    device: Mapping[str, str] | None = getattr(env, "device", None)
-    return dict(device) if device else None
+    return dict(getattr(env, "device", None) or {})

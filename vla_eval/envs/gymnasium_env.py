@@ -5,7 +5,7 @@ Knows nothing of policies. `vla_eval.tasks.register` names it to Gymnasium, `doc
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, get_args  # values of observations and infos, arguments of tasks
+from typing import Any, cast, get_args  # values of observations and infos, arguments of tasks
 
 import gymnasium as gym
 import numpy as np
@@ -17,7 +17,7 @@ from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE
 from vla_eval.core import EpisodeStart, FloatArray, SimEnv, StepResult
 from vla_eval.envs.factory import describe_env
 from vla_eval.envs.factory import make_env as make_sim_env
-from vla_eval.errors import InvalidActionError, TaskArgumentError, check_names, unknown_name
+from vla_eval.errors import InvalidActionError, TaskArgumentError, check_names
 from vla_eval.features import FPS, IMAGE_SIZE_PX
 from vla_eval.strict.calls import public
 from vla_eval.tasks.catalog import task_spec
@@ -225,8 +225,5 @@ def _refuse_maniskill(row: TaskSpec, given: Mapping[str, Any]) -> None:
 
 def render_settings(wrist_mesh: str, backend: str) -> RenderSettings:
     """Return how images are rendered; raise `UnknownNameError` for a mesh that does not exist."""
-    meshes: tuple[WristMesh, ...] = get_args(WristMesh)
-    for mesh in meshes:
-        if mesh == wrist_mesh:
-            return RenderSettings(wrist_mesh=mesh, backend=backend)
-    raise unknown_name("mesh", wrist_mesh, meshes, where="wrist_mesh")
+    check_names("mesh", [wrist_mesh], get_args(WristMesh), where="wrist_mesh")
+    return RenderSettings(wrist_mesh=cast("WristMesh", wrist_mesh), backend=backend)

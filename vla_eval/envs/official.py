@@ -203,7 +203,6 @@ class OfficialEpisode:
     """A running episode as noted last; what is between cue and choice is a delay, also where mugs move."""
 
     def __init__(self, row: TaskSpec, env: Any) -> None:
-        """Begin with the state after a reset."""
         self._row, self._env = row, env
         self.phase: Phase = self._phase(0)
         self.candidates = read_candidates(row, env, revealed=False)

@@ -6,8 +6,6 @@ takes it for the YCB object set.
 """
 
 import json
-import os
-import shutil
 import sys
 from pathlib import Path
 from typing import Any  # trimesh and ManiSkill's modules are untyped
@@ -21,6 +19,7 @@ from mani_skill.utils.building.actors import ycb
 from vla_eval.envs.official_settings import Mug
 from vla_eval.errors import MissingDependencyError
 from vla_eval.storage.cache import cached
+from vla_eval.storage.drafts import appearing
 from vla_eval.tasks.objects.mug import (
     BOTTOM_POSE,
     BOTTOM_RADIUS_M,
@@ -67,19 +66,12 @@ def _stand_in() -> Path:
     root = cached("official_mug")
     if root.is_dir():
         return root
-    draft = root.with_name(f"{root.name}.{os.getpid()}.tmp")
-    models = draft / FOLDER / "models" / ASSET
-    models.mkdir(parents=True, exist_ok=True)
     parts = [_placed(trimesh.creation.box(2 * np.asarray(halves)), pose) for pose, halves in mug_boxes()]
     parts.append(_placed(_bottom(), BOTTOM_POSE))
     # Each connected part becomes one convex collision shape.
     whole = trimesh.util.concatenate(parts)
-    whole.export(models / "collision.ply")
     colour = np.round(np.asarray(TERRACOTTA_RGBA) * 255).astype(np.uint8)
-    whole.visual = trimesh.visual.TextureVisuals(
-        material=trimesh.visual.material.SimpleMaterial(diffuse=colour)
-    )
-    whole.export(models / "textured.obj")
+    material = trimesh.visual.material.SimpleMaterial(diffuse=colour)
     half = HEIGHT_M / 2
     low, high = whole.bounds[0].tolist(), whole.bounds[1].tolist()
     facts = {
@@ -89,13 +81,13 @@ def _stand_in() -> Path:
             "density": MASS_KG / mug_volume_m3(),
         }
     }
-    (draft / FOLDER / "info_pick_v0.json").write_text(json.dumps(facts), encoding="utf-8")
-    try:
-        draft.rename(root)
-    except OSError:
-        if not root.is_dir():  # otherwise another worker was faster
-            raise
-        shutil.rmtree(draft)
+    with appearing(root) as draft:
+        models = draft / FOLDER / "models" / ASSET
+        models.mkdir(parents=True)
+        whole.export(models / "collision.ply")
+        whole.visual = trimesh.visual.TextureVisuals(material=material)
+        whole.export(models / "textured.obj")
+        (draft / FOLDER / "info_pick_v0.json").write_text(json.dumps(facts), encoding="utf-8")
     return root
 
 

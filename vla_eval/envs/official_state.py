@@ -108,7 +108,6 @@ class Choices:
     """
 
     def __init__(self, row: TaskSpec, env: Any, first: Vector) -> None:
-        """Begin an episode in which nothing has been chosen; `first` is (N, 3)."""
         self._pushes, self._env, self._first = _pushes(row), env, first
         self.chosen: list[int] = []
 

@@ -9,10 +9,8 @@ used unchanged if they are not as expected: slower, with the same images.
 import functools
 import hashlib
 import logging
-import os
 import re
 import shutil
-import tempfile
 from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
@@ -22,6 +20,7 @@ import sapien
 
 from vla_eval.errors import RenderingError
 from vla_eval.storage.cache import cache_dir
+from vla_eval.storage.drafts import appearing
 
 logger = logging.getLogger(__name__)
 
@@ -71,7 +70,10 @@ def _lean_copy(installed: Path) -> Path | None:
             digest.update(f"{name}\0{lean.get(name) or path.read_text(encoding='utf-8')}\0".encode())
     folder = cache_dir() / "shaders" / digest.hexdigest()
     if not folder.is_dir():
-        _publish(installed, lean, folder)
+        with appearing(folder) as draft:
+            shutil.copytree(installed, draft, dirs_exist_ok=True)
+            for name, text in lean.items():
+                (draft / name).write_text(text, encoding="utf-8")
     return folder
 
 
@@ -83,20 +85,3 @@ def _lean_texts(installed: Path) -> Iterator[tuple[str, str]]:
             if TABLE in text:
                 changed = _READING.sub("vec2(0)", _DECLARATION.sub("", text))
                 yield path.relative_to(installed).as_posix(), changed
-
-
-def _publish(installed: Path, lean: dict[str, str], folder: Path) -> None:
-    """Write the copy under another name and rename it, so that no other process sees half of it."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(dir=folder.parent))
-    try:
-        shutil.copytree(installed, draft / SHADERS)
-        for name, text in lean.items():
-            (draft / SHADERS / name).write_text(text, encoding="utf-8")
-        if not folder.is_dir():
-            os.rename(draft / SHADERS, folder)
-    except OSError:
-        if not folder.is_dir():  # another process was faster
-            raise
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)

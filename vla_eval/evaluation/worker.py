@@ -224,8 +224,7 @@ class EpisodeRunner:
                 f"found {env.spec}. The policy was made for the first. If the task is of another package: "
                 "its class must not change what `vla_eval.tasks.arguments.offered_by` reads."
             )
-        device = describe_device(env)
-        if device is not None:
+        if device := describe_device(env):
             self._tell(DeviceFound(device=device))
         return env
 

@@ -7,7 +7,7 @@ no seeds in its results. For figures use `mikasa-vla eval`.
 import functools
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any  # lerobot and gymnasium's vector environments are untyped here
+from typing import Any, cast  # lerobot and gymnasium's vector environments are untyped here
 
 import gymnasium as gym
 import numpy as np
@@ -18,7 +18,7 @@ from lerobot.envs.utils import _LazyAsyncVectorEnv, freeze_after_episode_end
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import StepResult
 from vla_eval.envs.gymnasium_env import TaskEnv, render_settings
-from vla_eval.errors import RecipeError, SpecMismatchError, unknown_name
+from vla_eval.errors import RecipeError, SpecMismatchError, check_names
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, FPS, STATE_KEY, STATE_NAMES, StateKind, proprioception
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import offered_by
@@ -187,10 +187,8 @@ class MikasaEnvConfig(EnvConfig):  # type: ignore[misc]  # lerobot is untyped
 
 
 def _state_kind(name: str) -> StateKind:
-    for kind in STATE_NAMES:
-        if kind == name:
-            return kind
-    raise unknown_name("kind of state", name, STATE_NAMES, where="env.state")
+    check_names("kind of state", [name], STATE_NAMES, where="env.state")
+    return cast("StateKind", name)
 
 
 def _vector(make: Callable[[], MikasaGym], n_envs: int, *, in_processes: bool) -> Any:

@@ -5,6 +5,7 @@ import errno
 import glob
 import os
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,6 +51,24 @@ def publish(draft: Path, path: Path) -> None:
     sync_tree(draft)
     os.rename(draft, path)
     sync_folder(path.parent)
+
+
+@contextlib.contextmanager
+def appearing(folder: Path) -> Iterator[Path]:
+    """Give an empty draft that gets the folder's name when it is filled; one that is there by then stays."""
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    place = tempfile.TemporaryDirectory(
+        prefix=f".{folder.name}-", dir=folder.parent, ignore_cleanup_errors=True
+    )
+    with place:
+        draft = Path(place.name, folder.name)
+        draft.mkdir()
+        try:
+            yield draft
+            draft.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # otherwise another process was faster
+                raise
 
 
 def link_file(source: Path, target: Path) -> None:

@@ -175,8 +175,7 @@ class ChoiceEnv(MemoryTableEnv):
     def is_placed(self, reach_m: FloatArray) -> Flags:
         """Return (B,) bool: the success rule holds, except that the arm may still move.
 
-        Args:
-            reach_m: (B,) the distance of the tool centre point from the point to touch.
+        `reach_m`: (B,) the distance of the tool centre point from the point to touch.
         """
         return reach_m <= self.goal_threshold_m
 

@@ -69,10 +69,6 @@ def states(joints: tuple[str, ...] = JOINT_NAMES, prompt_dims: tuple[str, ...] =
 def env_spec(*, control_mode: str = EE_DELTA_POSE, image_size_px: int = IMAGE_SIZE_PX) -> EnvSpec:
     """Return what all tasks have in common with the Panda, with an episode of one step.
 
-    Args:
-        control_mode: what an action means.
-        image_size_px: height and width of images.
-
     Raises:
         UnknownNameError: there is no such control mode.
     """

@@ -118,7 +118,6 @@ class MemoryTableEnv(TensorsOut):
         reconfiguration_freq: int | None = None,
         **kwargs: Any,
     ) -> None:
-        """Check the arguments and build the scene."""
         self.cue_steps_range = step_range("cue_steps", cue_steps)
         self.delay_steps_range = step_range("delay_steps", delay_steps)
         limits.check(NotNegative, swap_cue=swap_cue)
@@ -374,14 +373,6 @@ class MemoryTableEnv(TensorsOut):
         }
 
     # ---------------------------------------------------------------- reward
-
-    def dense_reward(self, terms: Info, info: Info) -> FloatArray:
-        """Return the (B,) sum of the terms, or `MAX_REWARD` where the success rule holds."""
-        total: FloatArray = np.zeros(self.num_envs, dtype=np.float32)
-        for term in terms.values():
-            total += term.astype(np.float32, copy=False)
-        total[info["success"]] = self.MAX_REWARD
-        return total
 
     def normalized_reward(self, info: Info) -> FloatArray:
         """Return the (B,) dense reward of the present step, divided by its value at success."""

@@ -54,7 +54,6 @@ class RememberEnv(ItemChoiceEnv):
     SLOWS_ANYWHERE = True  # official code
 
     def __init__(self, *args: Any, goal_threshold_m: Positive = 0.05, **kwargs: Any) -> None:
-        """Set the threshold of these tasks and build the scene."""
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
 
     def _load_scene(self, options: dict[str, Any]) -> None:

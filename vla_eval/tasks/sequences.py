@@ -281,20 +281,9 @@ class SeveralColorsEnv(ItemChoiceEnv):
 
     def evaluate(self) -> Info:
         """Read success, failure and choices; changes nothing."""
-        reach_m, static = self.target_distance_m(), self.is_static()
-        n_wrong, n_found = self._touched_wrongly.sum(axis=1), self._n_found()
-        found = n_found == self.n_shown
-        spoilt = n_wrong > 0
-        return {
-            "success": self.gated(found & static & ~spoilt),
-            "fail": spoilt if self.strict_choice else np.zeros_like(spoilt),
-            "is_obj_placed": reach_m <= self.goal_threshold_m,
-            "is_robot_static": static,
-            "target_distance_m": reach_m,
-            "first_choice": self._first_choice.copy(),
-            "n_found": n_found,
-            "n_wrong_choices": n_wrong,
-        }
+        info, n_found = super().evaluate(), self._n_found()
+        solved = (n_found == self.n_shown) & (info["n_wrong_choices"] == 0)
+        return {**info, "success": self.gated(solved & info["is_robot_static"]), "n_found": n_found}
 
     def oracle_info(self) -> NDArray[np.uint8]:
         """Return (B, L): the cubes that were shown, in the order shown."""

@@ -163,7 +163,6 @@ class ShellGameTouchEnv(ShellGameEnv):
     REACH_SCALE_PER_M = 5.0
 
     def __init__(self, *args: Any, goal_threshold_m: Positive = 0.08, **kwargs: Any) -> None:
-        """Give the threshold its default."""
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
 
     def reward_terms(self, info: Info) -> Info:

@@ -127,7 +127,6 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     def __init__(
         self, *args: Any, push_distance_m: Positive = 0.1, goal_threshold_m: Positive = 0.08, **kwargs: Any
     ) -> None:
-        """Refuse a goal that contains the mug's first position."""
         limits.check(Positive, push_distance_m=push_distance_m)
         limits.check_together(goal_threshold_m=goal_threshold_m, push_distance_m=push_distance_m)
         self.push_distance_m = push_distance_m
@@ -177,7 +176,6 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         official_mug_yaws: bool = False,
         **kwargs: Any,
     ) -> None:
-        """Refuse a goal that contains the mug's first position, and one that the arm cannot reach."""
         limits.check(LiftHeight, lift_height_m=lift_height_m)
         limits.check_together(goal_threshold_m=goal_threshold_m, lift_height_m=lift_height_m)
         self.lift_height_m = lift_height_m

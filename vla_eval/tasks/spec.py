@@ -168,22 +168,10 @@ class TaskSpec:
 
 
 def total_cue_steps(cue_steps: int, n_in_turn: int, gap_steps: int) -> int:
-    """Return the length of a cue.
-
-    Args:
-        cue_steps: steps for which each item is shown.
-        n_in_turn: how many items are shown one after another; 1 if all are shown at once.
-        gap_steps: steps between two of them.
-    """
+    """Return the length of a cue of `n_in_turn` items (1: all at once), each shown for `cue_steps`."""
     return n_in_turn * cue_steps + (n_in_turn - 1) * gap_steps
 
 
 def chance_of_several(n_items: int, n_shown: int, *, in_order: bool) -> float:
-    """Return the success rate of a perfect arm that ignores the cue but knows how many items were shown.
-
-    Args:
-        n_items: how many items there are.
-        n_shown: how many different ones were shown.
-        in_order: whether their order must also be the one shown.
-    """
+    """Return the success rate of a perfect arm that knows how many items were shown, but not which."""
     return 1 / (math.perm(n_items, n_shown) if in_order else math.comb(n_items, n_shown))

@@ -14,7 +14,6 @@ class WithoutCueEnv(MemoryTableEnv):
     """
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        """Refuse lengths of phases that do not exist."""
         for name in ("cue_steps", "delay_steps"):
             if name in kwargs:
                 raise TaskArgumentError(

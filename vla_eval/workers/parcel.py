@@ -1,11 +1,10 @@
 """Small folders that are sent to a machine that does not have them. Knows nothing of their content."""
 
-import os
-import shutil
-import tempfile
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
+
+from vla_eval.storage.drafts import appearing
 
 MAX_PARCEL_BYTES = 64_000_000
 """Of all folders of one checkpoint; the driver reads them into memory. Others need shared storage."""
@@ -37,20 +36,11 @@ def pack(path: str) -> PackedFolder:
 
 def unpack(packed: PackedFolder) -> None:
     """Write a folder; it appears whole or not at all. What is there already stays."""
-    target = Path(packed.path)
-    target.parent.mkdir(parents=True, exist_ok=True)
-    draft = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
-    try:
+    with appearing(Path(packed.path)) as draft:
         for name, content in packed.files.items():
             file = draft / name
             file.parent.mkdir(parents=True, exist_ok=True)
             file.write_bytes(content)
-        os.rename(draft, target)
-    except OSError:
-        if not target.is_dir():  # else another run has just written it
-            raise
-    finally:
-        shutil.rmtree(draft, ignore_errors=True)
 
 
 def _files(folder: Path) -> list[Path]:

@@ -7,7 +7,6 @@ cache.
 
 import functools
 import hashlib
-import os
 from pathlib import Path
 from typing import Any, ClassVar  # ManiSkill is untyped
 from xml.etree import ElementTree
@@ -18,6 +17,7 @@ from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 from mani_skill.utils.building.urdf_loader import URDFLoader
 
 from vla_eval.storage.cache import cached
+from vla_eval.storage.drafts import appearing
 from vla_eval.tasks.arm.camera_mesh import (
     GRID_M,
     VISIBLE_FILE,
@@ -35,8 +35,7 @@ _CAMERA_MESH = "realsense2_description/meshes/d415.stl"
 def changed_urdf(name: str, change: MeshChange) -> Path:
     """Return the URDF of a variant of the Panda with a changed camera mesh, from the cache or new in it.
 
-    The folder's name is a digest of its sources. It is created atomically by a rename, so workers that
-    start together cannot see a partial file.
+    The folder's name is a digest of its sources. Workers that start together cannot see a partial file.
     """
     source_urdf, stl = _PANDA_DIR / "panda_v3.urdf", (_PANDA_DIR / _CAMERA_MESH).read_bytes()
     digest = hashlib.sha256(f"{name} {GRID_M} {_PANDA_DIR}".encode() + source_urdf.read_bytes())
@@ -46,21 +45,15 @@ def changed_urdf(name: str, change: MeshChange) -> Path:
     urdf = folder / f"panda_v3_{name}.urdf"
     if urdf.exists():
         return urdf
-    draft = folder.with_name(f"{folder.name}.{os.getpid()}.tmp")
-    draft.mkdir(parents=True, exist_ok=True)
     mesh_name = f"d415_{name}.stl"
-    write_binary_stl(draft / mesh_name, change(stl))
     tree = ElementTree.parse(source_urdf)
     for mesh in tree.iter("mesh"):
         file = mesh.attrib["filename"]
         mesh.set("filename", str(folder / mesh_name if file == _CAMERA_MESH else _PANDA_DIR / file))
-    tree.write(draft / urdf.name)
-    (draft / f"panda_v3_{name}.srdf").write_bytes((_PANDA_DIR / "panda_v3.srdf").read_bytes())
-    try:
-        draft.rename(folder)
-    except OSError:
-        if not urdf.exists():  # otherwise another worker was faster
-            raise
+    with appearing(folder) as draft:
+        write_binary_stl(draft / mesh_name, change(stl))
+        tree.write(draft / urdf.name)
+        (draft / f"panda_v3_{name}.srdf").write_bytes((_PANDA_DIR / "panda_v3.srdf").read_bytes())
     return urdf
 
 

@@ -24,16 +24,9 @@ _NAMES = {"RememberColor": COLOR_NAMES, "RememberShape": SHAPE_NAMES}
 
 
 def item_names(task: str, n_items: int) -> tuple[str, ...]:
-    """Return the names of a task's items, by index.
+    """Return the names of a task's items; of one without a name (mugs, RememberShapeAndColor) its index.
 
-    Args:
-        task: id of a row or of a family, such as `RememberColor3-v0` or `RememberColor`, or of the official
-            package, `mikasa_vla/RememberColor3-VLA-v0`.
-        n_items: how many there are.
-
-    Returns:
-        One name per item; the index itself if the item has no name (mugs), or if its name depends on the
-        task's arguments (RememberShapeAndColor).
+    `task` is the id of a row, of a family, or of the official package: `mikasa_vla/RememberColor3-VLA-v0`.
     """
     family = task.rpartition("/")[2].partition("-")[0].rstrip("0123456789")
     names = _NAMES.get(family, ())

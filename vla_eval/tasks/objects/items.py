@@ -56,11 +56,9 @@ def _about_z(angle_rad: float) -> tuple[float, float, float, float]:
     return (math.cos(angle_rad / 2), 0.0, 0.0, math.sin(angle_rad / 2))
 
 
-def _ring(
-    n_parts: int, *, first_rad: float, last_rad: float, part: Callable[[float], Primitive]
-) -> tuple[Primitive, ...]:
-    step = (last_rad - first_rad) / n_parts
-    return tuple(part(first_rad + step * (k + 0.5)) for k in range(n_parts))
+def _ring(n_parts: int, angle_rad: float, part: Callable[[float], Primitive]) -> tuple[Primitive, ...]:
+    step = angle_rad / n_parts
+    return tuple(part(step * (k + 0.5)) for k in range(n_parts))
 
 
 def _tube_part(angle_rad: float, *, half_length_m: float) -> Primitive:
@@ -112,15 +110,10 @@ SHAPES = {
         ),
         Shape(
             name="torus",
-            parts=_ring(
-                8,
-                first_rad=0,
-                last_rad=TAU,
-                part=lambda a: _tube_part(a, half_length_m=S * math.tan(math.pi / 8)),
-            ),
+            parts=_ring(8, TAU, lambda a: _tube_part(a, half_length_m=S * math.tan(math.pi / 8))),
             rest_height_m=S / 2,
         ),
-        Shape(name="star", parts=_ring(5, first_rad=0, last_rad=TAU, part=_star_point), rest_height_m=BAR),
+        Shape(name="star", parts=_ring(5, TAU, _star_point), rest_height_m=BAR),
         Shape(
             name="pyramid",
             parts=(
@@ -140,12 +133,7 @@ SHAPES = {
         ),
         Shape(
             name="crescent",
-            parts=_ring(
-                12,
-                first_rad=0,
-                last_rad=math.pi,
-                part=lambda a: _tube_part(a, half_length_m=S * math.tan(math.pi / 24)),
-            ),
+            parts=_ring(12, math.pi, lambda a: _tube_part(a, half_length_m=S * math.tan(math.pi / 24))),
             rest_height_m=S / 2,
         ),
     )
