@@ -158,10 +158,7 @@ def did_you_mean(name: str, known: Iterable[str]) -> str:
     """Return `" Did you mean 'x'?"` for the closest known name, or `""` if none is close.
 
     Where one number or word of it is wrong, as in `RememberColor4-v0`, all that stand there are named.
-
-    Args:
-        name: what the user wrote.
-        known: the names that exist. Comparing ignores case.
+    Comparing ignores case.
     """
     by_folded = {candidate.lower(): candidate for candidate in known}
     # Longer names are not typos, and comparing takes time that grows with the square of the length.
@@ -189,7 +186,8 @@ def _levels(name: str, closest: str, known: Iterable[str]) -> list[str]:
 def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "") -> UnknownNameError:
     """Build the error for a name that does not exist: what it was, and a suggestion or what exists.
 
-    A long list is given only if no known name is close.
+    A long list is given only if no known name is close. `kind`: what is named, in the singular; `where`: the
+    field or flag in which it stands.
     """
     names = sorted(known)
     prefix = f"{where}: " if where else ""
@@ -201,17 +199,7 @@ def unknown_name(kind: str, name: str, known: Iterable[str], *, where: str = "")
 
 
 def check_names(kind: str, names: Iterable[str], known: Collection[str], *, where: str = "") -> None:
-    """Refuse the first name that does not exist.
-
-    Args:
-        kind: what is named, in the singular.
-        names: what the user wrote.
-        known: the names that exist.
-        where: the field or flag in which they stand.
-
-    Raises:
-        UnknownNameError: one does not exist.
-    """
+    """Raise `UnknownNameError` for the first name that does not exist; `kind` and `where` as above."""
     for name in names:
         if name not in known:
             raise unknown_name(kind, name, known, where=where)

@@ -266,7 +266,6 @@ _NAME = f"1 to {MAX_NAME} printable characters without '/' and '\\'"
 
 
 def _choice_is_right(record: EpisodeRecord) -> bool:
-    """Whether `first_choice_success` is what target and first choice say."""
     if record.first_choice_success is None:
         return True
     if record.first_choice is None:

@@ -114,7 +114,6 @@ class _Loop:
     cue_boxes: Callable[[int], CueBoxes]
 
     def begin(self, episodes: Sequence[EpisodeStart]) -> list[_Running]:
-        """Reset environment and policy."""
         self.heartbeat("reset")
         render = bool(self.policy.spec.cameras) or any(o.wants_images(0) for o in self.observers)
         results = self.env.reset({e.slot: e.seed for e in episodes}, render=render)
@@ -155,7 +154,6 @@ class _Loop:
                 observer.on_inference(episode.log.start, episode.log.n_steps, chunk)
 
     def step(self, active: Sequence[_Running]) -> None:
-        """Execute one control step in each running episode."""
         actions: dict[int, FloatArray] = {}
         for episode in active:
             action, slot = episode.executor.action(episode.log.n_steps), episode.log.start.slot

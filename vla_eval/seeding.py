@@ -39,7 +39,6 @@ class SeedRange:
     last: int
 
     def __contains__(self, seed: int) -> bool:
-        """Whether a seed is one of them."""
         return self.first <= seed <= self.last
 
 

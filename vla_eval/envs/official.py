@@ -114,7 +114,8 @@ class OfficialEnv:
     def _observation(
         self, env: Any, info: Any, true_state: PrivilegedState | None, *, render: bool
     ) -> Observation:
-        step = int(info["elapsed_steps"][0])
+        step, robot = int(info["elapsed_steps"][0]), env.agent.robot
+        state = {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}
         images = {}
         if render:
             for hidden in env._hidden_objects:
@@ -125,7 +126,7 @@ class OfficialEnv:
         return Observation(
             step=step,
             images={name: batch[0].copy() for name, batch in images.items()},
-            state={name: to_array(batch[0]) for name, batch in _robot_state(env).items()},
+            state={name: to_array(batch[0]) for name, batch in state.items()},
             privileged=true_state,
         )
 
@@ -267,8 +268,3 @@ class OfficialEpisode:
             bodies=read_bodies(row, env, candidates, self._first),
             tcp_yaw_rad=float(yaw_rad(to_array(tcp.pose.q))[0]),
         )
-
-
-def _robot_state(env: Any) -> dict[str, Any]:
-    robot = env.agent.robot
-    return {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}

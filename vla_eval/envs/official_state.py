@@ -63,7 +63,8 @@ def read_candidates(row: TaskSpec, env: Any, *, revealed: bool) -> Candidates | 
         now = [actors[key].pose.p[0] if revealed else places[key].reshape(-1)[:3] for key in keys]
         return Candidates(positions_m=_stack(now), target=keys.index(int(_own(env, names.target)[0])))
     if row.true_state == "mugs":
-        return Candidates(positions_m=_mug_positions_m(row, env), target=_target_mug(row, env))
+        target = "target_color" if "ColorLamp" in row.id else "cup_with_ball_number"
+        return Candidates(positions_m=_mug_positions_m(row, env), target=int(_own(env, target)[0]))
     return None
 
 
@@ -140,11 +141,6 @@ def _mug_positions_m(row: TaskSpec, env: Any) -> Vector:
     positions_m = _stack([_own(env, name).pose.p[0] for name in _MUGS])
     positions_m[positions_m[:, 2] > PARKED_ABOVE_M, 2] -= _own(env, "HEIGHT_OFFSET")
     return positions_m
-
-
-def _target_mug(row: TaskSpec, env: Any) -> int:
-    name = "target_color" if "ColorLamp" in row.id else "cup_with_ball_number"
-    return int(_own(env, name)[0])
 
 
 def _family(row: TaskSpec) -> str:

@@ -68,27 +68,19 @@ def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
     device = {"simulator": str(env.backend.sim_backend)}
     if settings.cameras:
         device["render_backend"] = str(env.backend.render_backend)
-        device["render_device"] = _render_device_name()
+        # The first device's name in SAPIEN's own list, such as `llvmpipe (LLVM 15.0.6, 256 bits)`.
+        lines = sapien.render.get_device_summary().splitlines()
+        names = [str(line.removeprefix("GPU:").strip()) for line in lines if line.startswith("GPU:")]
+        device["render_device"] = names[0] if names else "unknown to SAPIEN"
     return device
-
-
-def _render_device_name() -> str:
-    """Return the first device's name in SAPIEN's own list, such as `llvmpipe (LLVM 15.0.6, 256 bits)`."""
-    for line in sapien.render.get_device_summary().splitlines():
-        if line.startswith("GPU:"):
-            return str(line.removeprefix("GPU:").strip())
-    return "unknown to SAPIEN"
 
 
 def take_images(
     env: Any, cameras: tuple[str, ...], wrist_view: WristView | None = None
 ) -> dict[str, ImageArray]:
-    """Return camera name -> (B, H, W, 3) uint8.
+    """Return camera name -> (B, H, W, 3) uint8 of a ManiSkill environment.
 
-    Args:
-        env: a ManiSkill environment.
-        cameras: their names.
-        wrist_view: draws the wrist camera's image where it can; None: all are drawn with the whole scene.
+    `wrist_view` draws the wrist camera's image where it can; None: all are drawn with the whole scene.
     """
     if not cameras:
         raise RenderingError(

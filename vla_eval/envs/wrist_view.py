@@ -146,17 +146,12 @@ def _scene_like(original: Any) -> Any:
     scene = sapien.Scene([sapien.render.RenderSystem(system.device)])
     scene.render_system.ambient_light = system.ambient_light
     for light in system.lights:
-        scene.add_entity(_light_like(light))
+        copied, entity = type(light)(), sapien.Entity()
+        copied.color, copied.shadow, copied.local_pose = light.color, light.shadow, light.local_pose
+        entity.add_component(copied)
+        entity.pose = light.entity.pose
+        scene.add_entity(entity)
     return scene
-
-
-def _light_like(light: Any) -> Any:
-    copied = type(light)()
-    copied.color, copied.shadow, copied.local_pose = light.color, light.shadow, light.local_pose
-    entity = sapien.Entity()
-    entity.add_component(copied)
-    entity.pose = light.entity.pose
-    return entity
 
 
 def _copied(scene: Any, entity: Any) -> tuple[Any, Any]:

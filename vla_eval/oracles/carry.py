@@ -45,7 +45,6 @@ class _Play:
 
     @property
     def held(self) -> bool:
-        """Whether the fingers hold the cube."""
         return self.closing and self.arm.width_m < HELD_WIDTH_M
 
 

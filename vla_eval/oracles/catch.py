@@ -101,7 +101,6 @@ def _decide(play: _Play) -> _Play:
 
 
 def _command(play: _Play) -> model.Vector:
-    """Return the (3,) translation that the controller commands in this stage."""
     arm = play.arm
     if play.stage == "wait":
         return model.towards(np.array([*_waiting_place_m(play), HOVER_M]), arm)

@@ -35,7 +35,6 @@ class PushExpert:
 
 
 def _goal(mug_m: model.Vector, end_x_m: float, arm: model.ArmState) -> model.Vector:
-    """Return the next target of the tool centre point."""
     x, y, z = (float(v) for v in arm.position_m)
     behind_x, mug_y = float(mug_m[0]) - BEHIND_M, float(mug_m[1])
     in_lane = abs(y - mug_y) < LANE_M

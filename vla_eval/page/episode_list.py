@@ -23,13 +23,6 @@ class EpisodeList(NamedTuple):
     data: Markup
 
 
-class _Files(NamedTuple):
-    """Addresses of an episode's captures; None where there is none."""
-
-    video: str | None = None
-    rrd: str | None = None
-
-
 def episode_list(material: Material, folder: Path | None) -> EpisodeList:
     """Return all episodes of the table's rows, in the order of `FIELDS`; what is undefined is null."""
     files = _files(material, folder or Path())
@@ -59,7 +52,7 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
                     [
                         *(number, record.run, record.seed, OUTCOMES.index(record.outcome)),
                         *(record.success_step, record.target, record.first_choice, error),
-                        *files.get(id(record), _Files()),
+                        *files.get(id(record), (None, None)),
                     ]
                 )
     names = {"fields": FIELDS, "outcomes": OUTCOMES}
@@ -69,14 +62,14 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
     return EpisodeList(len(episodes), Markup(text.replace("<", "\\u003c")))
 
 
-def _files(material: Material, folder: Path) -> dict[int, _Files]:
-    """Return the captures of each record that has any, as addresses relative to the page."""
+def _files(material: Material, folder: Path) -> dict[int, tuple[str | None, ...]]:
+    """Return the addresses, relative to the page, of video and rerun file of each record that has any."""
     found = {}
     for run in material.runs:
         for record in run.records:
             places = (video_file(run.path, record), rrd_file(run.path, record))
             if any(place.is_file() for place in places):
-                found[id(record)] = _Files(
-                    *(quote(os.path.relpath(one, folder)) if one.is_file() else None for one in places)
+                found[id(record)] = tuple(
+                    quote(os.path.relpath(one, folder)) if one.is_file() else None for one in places
                 )
     return found

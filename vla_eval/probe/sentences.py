@@ -121,7 +121,6 @@ def notes(table: ProbeTable) -> list[str]:
 
 
 def _columns(rows: Sequence[ProbeRow]) -> Iterator[str]:
-    """Explain the columns in which any row has a value."""
     if any(row.swap for row in rows):
         yield (
             "sensitivity: share of pairs whose choice differs between the two worlds (for sets: the items "

@@ -98,7 +98,6 @@ def _shown_episodes(row: Row) -> str:
 
 
 def _interval_notes(rows: Sequence[Row]) -> Iterator[str]:
-    """Say which interval is used where."""
     found = [row[SUCCESS] for row in rows]
     if any(one.interval == "wilson" and one.n_runs == 1 for one in found):
         yield "success once, one run: 95 % Wilson interval over its episodes."

@@ -66,7 +66,6 @@ def _shown_chance(row: Row) -> str:
 
 
 def _paired_notes(rows: Sequence[Row]) -> Iterator[str]:
-    """Say what the comparisons with the baselines are."""
     found = [(row, one) for row in rows for one in row[PAIRED] if one is not None]
     if not found:
         return

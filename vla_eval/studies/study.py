@@ -91,23 +91,14 @@ def finetune_study(
         todo = [one._replace(config=replace(one.config, allow_unreplayed=True)) for one in todo]
     if backend is LOCAL:
         return _finetune_here(study, todo, say=say, is_stopping=is_stopping)
-    from vla_eval.studies.study import finetune_on
-
-    return finetune_on(
-        backend,
-        todo,
-        logs=study.out / "logs",
-        is_tiny=study.is_tiny,
-        command=study.command,
-        say=say,
-        is_stopping=is_stopping,
-    )
+    return _finetune_on(study, backend, todo, say=say, is_stopping=is_stopping)
 
 
 def _finetune_here(
     study: Study, todo: Sequence[Finetuning], *, say: Say, is_stopping: Callable[[], bool]
 ) -> bool:
     """Run one fine-tuning after the other in this process: each takes all GPUs of this machine."""
+    from vla_eval.testing.process_memory import free_unused
     from vla_eval.training.finetune import finetune
 
     with tiny_models(study):
@@ -124,7 +115,7 @@ def _finetune_here(
                 if not done.is_finished:
                     say(f"{name}: stopped at step {done.step}. To resume: {study.command}")
                     return False
-            _free_memory()
+            free_unused()
     return True
 
 
@@ -182,39 +173,23 @@ def tiny_models(study: Study) -> contextlib.AbstractContextManager[None]:
     return tiny_forms()
 
 
-def _free_memory() -> None:
-    import gc
-
-    import torch
-
-    gc.collect()
-    if torch.cuda.is_available():
-        torch.cuda.empty_cache()
-
-
 TINY_RUNNER = "vla_eval.testing.tiny_models:tiny_finetune_runner"
 MAX_TRIES = 2  # of one fine-tuning, since a machine may hiccup; each resumes from its last checkpoint
 
 
-def finetune_on(
-    backend: Backend,
-    todo: Sequence[Finetuning],
-    *,
-    logs: Path,
-    is_tiny: bool,
-    command: str,
-    say: Callable[[str], None],
-    is_stopping: Callable[[], bool],
+def _finetune_on(
+    study: Study, backend: Backend, todo: Sequence[Finetuning], *, say: Say, is_stopping: Callable[[], bool]
 ) -> bool:
-    """Run the fine-tunings, a GPU each; return False if asked to stop. All machines share `logs`."""
+    """Run the fine-tunings, a GPU each; return False if asked to stop. All machines share the logs."""
+    logs = study.out / "logs"
     logs.mkdir(parents=True, exist_ok=True)
-    jobs = [FinetuneJob(config=one.config, command=command, name=one.name) for one in todo]
+    jobs = [FinetuneJob(config=one.config, command=study.command, name=one.name) for one in todo]
     timeouts = TimeoutConfig(setup_seconds=MAX_SECONDS)
-    runner = RunnerClass(target=TINY_RUNNER if is_tiny else RUNNER)
+    runner = RunnerClass(target=TINY_RUNNER if study.is_tiny else RUNNER)
     spec = WorkerSpec(runner=runner, answers=(Finetuned,), timeouts=timeouts, logs=logs)
     size = max(1, min(len(jobs), backend.n_gpus or backend.n_cores))
     pool: Pool[FinetuneJob, Finetuned] = backend.pool(spec, size=size, takes_gpu=True)
-    failed = _run(pool, JobList(jobs), n_jobs=len(jobs), say=say, is_stopping=is_stopping)
+    failed = _run(pool, jobs, say=say, is_stopping=is_stopping)
     if failed is None:
         return False
     if failed:
@@ -227,13 +202,13 @@ def finetune_on(
 
 def _run(
     pool: Pool[FinetuneJob, Finetuned],
-    queue: JobList[FinetuneJob],
+    jobs: Sequence[FinetuneJob],
     *,
-    n_jobs: int,
-    say: Callable[[str], None],
+    say: Say,
     is_stopping: Callable[[], bool],
 ) -> list[str] | None:
     """Run the jobs; return a sentence about each that failed, or None if it was asked to stop."""
+    queue = JobList(jobs)
     n_tries: Counter[str] = Counter()
     failed: list[str] = []
     n_done = 0
@@ -251,7 +226,7 @@ def _run(
                     continue
                 failed.append(f"{job.name}: {answer.error.kind}: {answer.error.message}")
             n_done += 1
-            say(f"[{n_done}/{n_jobs}] {job.name}: {_outcome(answer)}")
+            say(f"[{n_done}/{len(jobs)}] {job.name}: {_outcome(answer)}")
     return failed
 
 

@@ -47,10 +47,7 @@ ANNOTATIONS: Mapping[str, Any] = {  # Any: type annotations
 def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
     """Check all that can be wrong with a task's arguments; a class of another package may refuse more.
 
-    Args:
-        spec: a row of the catalogue, or a family.
-        given: the user's arguments.
-        rows: the catalogue, for the message.
+    `spec` is a row of the catalogue, or a family; `rows` is the catalogue, for the message.
 
     Raises:
         TaskArgumentError: a required argument of a family is missing; or an argument needs candidates,

@@ -77,7 +77,6 @@ class ItemChoiceEnv(ChoiceEnv):
         return self.parking_pose(item.name, half_height_m=item.shape.rest_height_m)
 
     def _sample_slots(self, env: int) -> None:
-        """Draw where each item lies in the response phase."""
         places = self._places_m(self.episode_generator(env, Stream.LAYOUT))
         order = self.episode_generator(env, Stream.PERMUTATION).permutation(self.n_items)
         self._slots[env, :, :2] = places[order]

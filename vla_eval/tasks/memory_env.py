@@ -265,11 +265,7 @@ class MemoryTableEnv(TensorsOut):
         return index
 
     def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
-        """Hide and reveal objects where a phase begins at `step`; no other method does.
-
-        Returns:
-            Whether anything was moved.
-        """
+        """Hide and reveal objects where a phase begins at `step`; return whether any was moved."""
         raise NotImplementedError
 
     def _update_latches(self, step: Steps) -> None:
@@ -296,13 +292,10 @@ class MemoryTableEnv(TensorsOut):
             self.scene._reset_mask = previous
 
     def move(self, actor: Actor, mask: Flags, poses: FloatArray | sapien.Pose) -> None:
-        """Move an actor, at rest, to a pose in the environments of the mask.
+        """Move an actor, at rest, to a pose in the environments of the mask (B,).
 
-        Args:
-            actor: dynamic or kinematic.
-            mask: (B,) bool.
-            poses: (B, 7) positions and rotations (wxyz), of which the rows of the mask are used, or one pose
-                for all; world frame.
+        `poses`, world frame, are (B, 7) positions and rotations (wxyz), of which the rows of the mask are
+        used, or one for all.
         """
         if not anywhere(mask):
             return

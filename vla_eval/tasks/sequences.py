@@ -254,7 +254,6 @@ class SeveralColorsEnv(ItemChoiceEnv):
         return tuple(int(i) for i in self._sequence[env])
 
     def _n_found(self) -> Indices:
-        """Return (B,) how many right cubes were touched."""
         n_found: Indices = ((self._touch_rank > 0) & ~self._touched_wrongly).sum(axis=1)
         return n_found
 

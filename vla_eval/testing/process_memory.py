@@ -25,11 +25,17 @@ def peak_rss_bytes() -> int:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
 
 
+def free_unused() -> None:
+    """Free what is not used, on the GPU, too."""
+    gc.collect()  # a policy and its processors refer to each other
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()
+
+
 def reset_device_peak(device: str) -> None:
     """Free what is not used, and start the peak from what is left, not from a model measured before."""
     if torch.device(device).type == "cuda":
-        gc.collect()  # a policy and its processors refer to each other
-        torch.cuda.empty_cache()
+        free_unused()
         torch.cuda.reset_peak_memory_stats(device)
 
 

@@ -4,7 +4,6 @@ import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
 from vla_eval.core import EpisodeStart, Stage
@@ -54,8 +53,10 @@ class EpisodeCapture:
         """Write the captures of a finished batch; `film` renders those that have no images yet."""
         for start, record in zip(starts, records, strict=True):
             tape = tapes.episodes.get(start.slot)
+            index, is_success = record.seed - self.seed_start, record.outcome == "success"
             for_video, for_rrd = (
-                self._wants(which, record) for which in (self.config.video, self.config.rrd)
+                is_wanted(which, run=record.run, index=index, is_success=is_success)
+                for which in (self.config.video, self.config.rrd)
             )
             if tape is None or not (for_video or for_rrd):
                 continue
@@ -78,7 +79,3 @@ class EpisodeCapture:
 
                 heartbeat("step")
                 write_rrd(tape, record, rrd_file(self.folder, record), env=env)
-
-    def _wants(self, which: Any, record: EpisodeRecord) -> bool:
-        index = record.seed - self.seed_start
-        return is_wanted(which, run=record.run, index=index, is_success=record.outcome == "success")

@@ -139,7 +139,6 @@ def _write_parts(draw: ImageDraw.ImageDraw, parts: Sequence[Part], top: int) -> 
 def _fitted(
     draw: ImageDraw.ImageDraw, text: str, font: ImageFont.FreeTypeFont | ImageFont.ImageFont, width: float
 ) -> str:
-    """Return the text, cut to what fits."""
     if draw.textlength(text, font=font) <= width:
         return text
     while text and draw.textlength(f"{text}...", font=font) > width:

@@ -1,9 +1,9 @@
 """Published results as data, from `published.yaml`; a value that a source does not state is None."""
 
 import functools
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 from vla_eval.errors import unknown_name
 from vla_eval.strict.bounds import require
@@ -109,15 +109,14 @@ class Published:
         return sum(one.rate for one in result.rates.values()) / len(board.tasks)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PaperFigure:
-    """One cell of the paper's table of VLA models."""
+class PaperFigure(NamedTuple):
+    """One cell of the paper's table of VLA models, which states all of it."""
 
     task: str
     model: str
-    n_action_steps: int
+    n_action_steps: int | None
     success_once: float
-    sem: float
+    sem: float | None
 
 
 @functools.cache
@@ -127,23 +126,17 @@ def load_published() -> Published:
     return decode(Published, load_yaml(text, where=PUBLISHED_FILE.name), where=PUBLISHED_FILE.name)
 
 
-def paper_figures() -> Iterator[PaperFigure]:
-    """Yield the cells of the paper's table of VLA models, model by model.
+def paper_figures() -> list[PaperFigure]:
+    """Return the cells of the paper's table of VLA models, model by model.
 
     Source: "Memory, Benchmark & Robots" (ICLR 2026), appendix "VLA baselines", table "Performance of VLA
     models on selected memory-intensive tasks from the MIKASA-Robo benchmark". Its caption: success rates
     over 100 evaluation episodes, mean ± SEM; three training runs, seeds 1 to 100 (appendix "Experiments
     Reproducing and Compute Resources").
     """
-    for one in load_published().results:
-        if one.source != PAPER or one.family != PAPER_FAMILY:
-            continue
-        for task, rate in one.rates.items():
-            assert one.n_action_steps is not None and rate.spread is not None  # tested
-            yield PaperFigure(
-                task=task,
-                model=one.method,
-                n_action_steps=one.n_action_steps,
-                success_once=rate.rate,
-                sem=rate.spread,
-            )
+    return [
+        PaperFigure(task, one.method, one.n_action_steps, rate.rate, rate.spread)
+        for one in load_published().results
+        if one.source == PAPER and one.family == PAPER_FAMILY
+        for task, rate in one.rates.items()
+    ]

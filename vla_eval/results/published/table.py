@@ -1,7 +1,6 @@
 """Published results as tables below a success table: the rates, and how they were measured."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict
 from functools import partial
 
 from vla_eval.config.files import to_data
@@ -47,9 +46,8 @@ def published_side_tables(board: str) -> list[SideTable]:
 def paper_side_table(table: Table) -> SideTable:
     """Return the paper's results of VLA models for the tasks of a table."""
     tasks = dict.fromkeys(row.task for row in table.rows)
-    cells = list(paper_figures())
-    figures = [figure for task in tasks for figure in cells if figure.task == task]
-    fields = [asdict(one) for one in figures]
+    figures = [figure for task in tasks for figure in paper_figures() if figure.task == task]
+    fields = [one._asdict() for one in figures]
     return SideTable(
         title=f"The paper's figures, not measured here ({PAPER_PROTOCOL})",
         columns=_PAPER_COLUMNS,

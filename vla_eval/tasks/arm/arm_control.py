@@ -202,14 +202,9 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
 
 
 def drive_together(envs: Sequence[ArmControl], actions: FloatArray) -> None:
-    """Give actions to the controllers of environments alike: `executed_action` says what will be done.
+    """Give actions (N, A), float32, to environments alike: `executed_action` says what will be done.
 
-    Args:
-        envs: one, or several on the CPU simulator.
-        actions: (N, A) float32, a row for each of their arms, in order.
-
-    Raises:
-        ValueError: an action is not a number.
+    There is one environment, or several on the CPU simulator. A `ValueError` refuses what is not a number.
     """
     if anywhere(np.isnan(actions)):
         raise ValueError(f"An action is not a number: {actions.tolist()}.")

@@ -102,13 +102,8 @@ def _row(line: dict[str, str]) -> TaskSpec:
     )
 
 
-def _read_table() -> dict[str, TaskSpec]:
-    text = files("vla_eval.tasks.catalogs").joinpath(TABLE).read_text(encoding="utf-8")
-    rows = [_row(line) for line in csv.DictReader(text.splitlines(), delimiter=";")]
-    return {row.id: row for row in rows}
-
-
-MIKASA_VLA_90 = _read_table()
+_TEXT = files("vla_eval.tasks.catalogs").joinpath(TABLE).read_text(encoding="utf-8")
+MIKASA_VLA_90 = {row.id: row for row in map(_row, csv.DictReader(_TEXT.splitlines(), delimiter=";"))}
 
 
 def original_tasks(rows: Iterable[TaskSpec]) -> dict[str, TaskSpec]:

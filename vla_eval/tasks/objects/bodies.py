@@ -50,7 +50,6 @@ def _on_gpu(body: Any) -> bool:
 
 
 def _sapien_pose(body: Any) -> Any:
-    """Return the `sapien.Pose` of a body of a scene on the CPU."""
     one = body._objs[0]
     return one.entity_pose if isinstance(body, Link) else one.pose
 
