@@ -70,8 +70,7 @@ def advance_gripper(arm: ArmState, turn: float, gripper: float, *, held_width_m:
 
 def towards(goal_m: Vector, arm: ArmState) -> Vector:
     """Return the (3,) translation that moves the arm to a point: half the distance per step, at most 1."""
-    translation: Vector = np.clip(POSITION_GAIN_PER_M * (goal_m - arm.position_m), -1, 1)
-    return translation
+    return np.clip(POSITION_GAIN_PER_M * (goal_m - arm.position_m), -1, 1)
 
 
 def follow(

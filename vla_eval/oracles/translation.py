@@ -94,5 +94,4 @@ def translated(rows: NDArray[np.float32], mode: str, qpos: Vector, qvel: Vector)
 
 def _within_bounds(numbers: Vector) -> Vector:
     """Return numbers in [-1, 1] in the same direction."""
-    scaled: Vector = numbers / max(float(np.abs(numbers).max()), 1.0)
-    return scaled
+    return numbers / max(float(np.abs(numbers).max()), 1.0)

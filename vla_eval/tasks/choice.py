@@ -99,8 +99,7 @@ class ChoiceEnv(MemoryTableEnv):
     def final_positions_m(self) -> FloatArray:
         """Return (B, N, 3): where the candidates are, or will be when the response phase begins."""
         revealed = self.response_begun()[:, None, None]
-        positions: FloatArray = np.where(revealed, self.candidate_positions_m(), self._slots)
-        return positions
+        return np.where(revealed, self.candidate_positions_m(), self._slots)
 
     def touch_points_m(self) -> FloatArray:
         """Return (B, N, 3): the points that the tool centre point must come near, world frame."""

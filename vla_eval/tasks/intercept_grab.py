@@ -64,8 +64,7 @@ class InterceptGrabEnv(RollingBallEnv):
         offset = np.abs(self._tcp_to_ball_m())
         inside = (offset[:, :2] <= GRIP_HALF_PLANE_M).all(axis=1) & (offset[:, 2] <= GRIP_HALF_HEIGHT_M)
         near = length(offset) <= GRIP_RADIUS_M
-        held: Flags = inside & near & (self.gripper_width_m() >= BALL_DIAMETER_WIDTH_M)
-        return held
+        return inside & near & (self.gripper_width_m() >= BALL_DIAMETER_WIDTH_M)
 
     def reward_terms(self, info: Info) -> Info:
         """Reach the ball, get it between the fingers, close them, hold it."""

@@ -261,8 +261,7 @@ class MemoryTableEnv(TensorsOut):
 
     def phase_index(self, step: Steps) -> Indices:
         """Return (B,) indices into `PHASES` for observations after `step` control steps."""
-        index: Indices = (step >= self._cue_end_step).astype(np.int64) + (step >= self._response_step)
-        return index
+        return (step >= self._cue_end_step).astype(np.int64) + (step >= self._response_step)
 
     def _on_phase_edges(self, step: Steps, mask: Flags) -> bool:
         """Hide and reveal objects where a phase begins at `step`; return whether any was moved."""
@@ -313,8 +312,7 @@ class MemoryTableEnv(TensorsOut):
 
     def response_begun(self) -> Flags:
         """Return (B,) bool: the response phase has begun."""
-        begun: Flags = self.step_count() >= self._response_step
-        return begun
+        return self.step_count() >= self._response_step
 
     def gated(self, success: Flags) -> Flags:
         """Return success where it counts: in the response phase, or always without the gate."""

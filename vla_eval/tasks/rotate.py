@@ -170,8 +170,7 @@ class RotateEnv(WithoutCueEnv):
         if self.position_threshold_m is None:
             return np.ones(self.num_envs, dtype=np.bool_)
         shift_m = self._shift_m()
-        in_place: Flags = np.maximum(shift_m[:, 0], shift_m[:, 1]) < self.position_threshold_m
-        return in_place
+        return np.maximum(shift_m[:, 0], shift_m[:, 1]) < self.position_threshold_m
 
     def _is_level(self) -> Flags:
         if self.tilt_threshold_rad is None:

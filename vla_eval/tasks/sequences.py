@@ -235,8 +235,7 @@ class SeveralColorsEnv(ItemChoiceEnv):
     def _turn_steps(self) -> Steps:
         """Return (B,) the steps from one cube to the next: `total_cue_steps` solved for them."""
         cue_steps = self._cue_end_step - self.cue_after_steps
-        steps: Steps = (cue_steps + self.gap_steps) // self.n_shown
-        return steps
+        return (cue_steps + self.gap_steps) // self.n_shown
 
     def shown_candidates(self, env: int) -> tuple[int, ...]:
         """Return the right candidates whose cue is in view now: one at most if they are shown in turn."""

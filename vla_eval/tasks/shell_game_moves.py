@@ -206,8 +206,7 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         quaternions = np.array([_upside_down_wxyz(turn) for turn in OFFICIAL_TURNS], dtype=np.float32)
         # The handles belong to the scene: with `swap_cue` they stay as they were drawn.
         drawn = (self._target - self.swap_cue) % N_MUGS
-        turned: FloatArray = quaternions[drawn] if self.official_mug_yaws else quaternions[-1]
-        return turned
+        return quaternions[drawn] if self.official_mug_yaws else quaternions[-1]
 
     def _is_grasped(self) -> Flags:
         grasped = np.stack([self.grasps(actor) for actor in self.candidates], axis=1)

@@ -84,8 +84,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
     def gripper_width_m(self) -> FloatArray:
         """Return the (B,) gap between the fingers."""
         qpos = self.qpos()
-        width: FloatArray = qpos[:, -2] + qpos[:, -1]
-        return width
+        return qpos[:, -2] + qpos[:, -1]
 
     def arm_qvel(self) -> FloatArray:
         """Return the (B, J) velocities of the joints that move the hand, rad/s."""

@@ -61,8 +61,7 @@ def simplified(stl: bytes) -> Triangles:
 def visible(n_triangles: int) -> NDArray[np.bool_]:
     """Return (n_triangles,) bool: which triangles of the known mesh a view from outside can show."""
     packed = zlib.decompress((resources.files("vla_eval.tasks.arm") / VISIBLE_FILE).read_bytes())
-    bits: NDArray[np.bool_] = np.unpackbits(np.frombuffer(packed, np.uint8), count=n_triangles).astype(bool)
-    return bits
+    return np.unpackbits(np.frombuffer(packed, np.uint8), count=n_triangles).astype(bool)
 
 
 def snap_to_grid(triangles: FloatArray, grid_m: float) -> FloatArray:

@@ -82,5 +82,4 @@ def ycb_mug_builder(scene: ManiSkillScene) -> ActorBuilder:
             f"mug='ycb' needs the YCB asset '025_mug', expected in {folder}. Install it with "
             "`python -m mani_skill.utils.download_asset ycb`, or use mug='primitive'."
         )
-    builder: ActorBuilder = actors.get_actor_builder(scene, id="ycb:025_mug")
-    return builder
+    return actors.get_actor_builder(scene, id="ycb:025_mug")
