@@ -29,11 +29,7 @@ from vla_eval.strict.bounds import MAX_STEPS, Bounds, Steps, check_bounds
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChunkingSettings:
-    """How chunks are executed, at any n_action_steps: the section `chunking` of an evaluation.
-
-    Raises:
-        RecipeError: a value out of its range.
-    """
+    """How chunks are executed, at any n_action_steps: the section `chunking` of an evaluation."""
 
     mode: Literal["receding_horizon", "temporal_ensemble"] = "receding_horizon"
     delay_steps: Annotated[int, Bounds(0, MAX_STEPS)] = 0

@@ -27,19 +27,14 @@ ImageArray = NDArray[np.uint8]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observation:
-    """What can be observed after `step` control steps.
+    """What can be observed after `step` control steps."""
 
-    Attributes:
-        step: control steps executed since reset; 0 is the reset observation.
-        images: camera name -> (H, W, 3) uint8 RGB. Empty if no image was requested: a camera
-            is never replaced by a blank one.
-        state: name -> (D,) float32, as `EnvSpec.states` describes them.
-        privileged: the true state of the world; None unless the policy declares that it is privileged.
-    """
-
-    step: int
+    step: int  # control steps executed since reset; 0 is the reset observation
+    # camera name -> (H, W, 3) uint8 RGB. Empty if no image was requested: a camera is never replaced by a
+    # blank one.
     images: Mapping[str, ImageArray]
-    state: Mapping[str, FloatArray]
+    state: Mapping[str, FloatArray]  # name -> (D,) float32, as `EnvSpec.states` describes them
+    # the true state of the world; None unless the policy declares that it is privileged
     privileged: PrivilegedState | None = None
 
     def as_declared(self, spec: PolicySpec) -> "Observation":
@@ -69,36 +64,23 @@ class ObservationWindow:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ActionChunk:
-    """Actions for the control steps from the observed one on.
+    """Actions for the control steps from the observed one on."""
 
-    Attributes:
-        actions: (T, A) float32; row i is meant for step `window.last.step + i`.
-    """
-
-    actions: FloatArray
+    actions: FloatArray  # (T, A) float32; row i is meant for step `window.last.step + i`
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeStart:
-    """What a policy gets when an episode begins.
+    """What a policy gets when an episode begins."""
 
-    Attributes:
-        slot: the slot the episode runs in.
-        task: task id, for example `RememberColor3-v0`.
-        seed: the episode's seed; the environment is reset with it.
-        run: which of several independent runs (training seeds) this is, from 0.
-        instruction: the language instruction.
-        horizon_steps: the episode ends after so many control steps.
-        row: the episode's row in a forward pass that it shares with others. Batched results are bit-identical
-            only at a fixed row and batch size, so the plan fixes the row.
-    """
-
-    slot: int
-    task: str
-    seed: int
-    run: int
+    slot: int  # the slot the episode runs in
+    task: str  # task id, for example `RememberColor3-v0`
+    seed: int  # the episode's seed; the environment is reset with it
+    run: int  # which of several independent runs (training seeds) this is, from 0
     instruction: str
-    horizon_steps: int
+    horizon_steps: int  # the episode ends after so many control steps
+    # the episode's row in a forward pass that it shares with others. Batched results are bit-identical only
+    # at a fixed row and batch size, so the plan fixes the row.
     row: int = 0
 
     def worded(self, wording: Mapping[str, str]) -> "EpisodeStart":
@@ -111,22 +93,15 @@ class EpisodeStart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepResult:
-    """What comes back from a reset or a control step of one slot.
+    """What comes back from a reset or a control step of one slot."""
 
-    Attributes:
-        observation: what can be observed now.
-        status: what the task says of the episode so far.
-        reward: the reward of the step; 0 for a reset.
-        executed_action: (A,) the action as it was carried out: clipped to the action space, and replaced
-            by holding still while the task freezes the arm. None for a reset.
-        wording: of a reset: what to put in place of the words in braces of the instruction, where it differs
-            per episode.
-    """
-
-    observation: Observation
-    status: TaskStatus
-    reward: float = 0.0
+    observation: Observation  # what can be observed now
+    status: TaskStatus  # what the task says of the episode so far
+    reward: float = 0.0  # of the step; 0 for a reset
+    # (A,) the action as it was carried out: clipped to the action space, and replaced by holding still while
+    # the task freezes the arm. None for a reset.
     executed_action: FloatArray | None = None
+    # of a reset: what to put in place of the words in braces of the instruction, where it differs per episode
     wording: Mapping[str, str] = field(default_factory=dict)
 
 

@@ -49,19 +49,12 @@ class EpisodeKey(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeError:
-    """Why an episode has no result.
+    """Why an episode has no result."""
 
-    Attributes:
-        kind: class name of the exception, or `WorkerCrashed`, `StepTimeout`, `InferenceTimeout` …
-        stage: `setup`, `reset`, `step` or `inference`.
-        message: what was expected, found, where, next action.
-        details: the traceback, or what else helps to find the cause; may be long.
-    """
-
-    kind: str
-    stage: str
-    message: str
-    details: str | None = None
+    kind: str  # class name of the exception, or `WorkerCrashed`, `StepTimeout`, `InferenceTimeout` …
+    stage: str  # `setup`, `reset`, `step` or `inference`
+    message: str  # what was expected, found, where, next action
+    details: str | None = None  # the traceback, or what else helps to find the cause; may be long
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -172,20 +165,14 @@ REQUIRED_FIELDS = tuple(field.name for field in fields(EpisodeRecord) if field.n
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeTiming:
-    """Wall-clock seconds of one episode; kept next to the record, never part of it.
-
-    Attributes:
-        key: the episode's.
-        total_seconds, reset_seconds, step_seconds, inference_seconds: of the episode, and of its parts.
-        kind: name of the kind of machine that ran it; None: that of the run's environment.
-    """
+    """Wall-clock seconds of one episode and its parts; kept next to the record, never part of it."""
 
     key: EpisodeKey
     total_seconds: Seconds
     reset_seconds: Seconds
     step_seconds: Seconds
     inference_seconds: Seconds
-    kind: str | None = None
+    kind: str | None = None  # name of the kind of machine that ran it; None: that of the run's environment
 
     def to_json(self) -> str:
         """Return the timing as one line of JSON, without the line's end."""

@@ -28,24 +28,18 @@ from vla_eval.specs import check_compatible
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RolloutSettings:
-    """How to run: chunk execution, whether to render each frame, whether to stop at success.
+    """How to run: chunk execution, whether to render each frame, whether to stop at success."""
 
-    Attributes:
-        chunking: how chunks become actions.
-        eager_rendering: render every frame also for a policy that reads only the last one. Changes no
-            result; for checking exactly that.
-        stop_at_success: end an episode at its first success; success_at_end is then unknown.
-        steps_after_success: with `stop_at_success`, continue for this many control steps.
-        reset_policy_at_step: reset the policy in mid-episode: at the first inference at or after this
-            control step it is reset for the episode, and is given no frame of an earlier step. None: never.
-        cue_view: what the policy is given to see of the cue; observers get what was rendered.
-    """
-
-    chunking: ChunkingSpec
+    chunking: ChunkingSpec  # how chunks become actions
+    # render every frame also for a policy that reads only the last one. Changes no result; for checking
+    # exactly that.
     eager_rendering: bool = False
-    stop_at_success: bool = False
-    steps_after_success: int = 0
+    stop_at_success: bool = False  # end an episode at its first success; success_at_end is then unknown
+    steps_after_success: int = 0  # with `stop_at_success`, continue for this many control steps
+    # reset the policy in mid-episode: at the first inference at or after this control step it is reset for
+    # the episode, and is given no frame of an earlier step. None: never.
     reset_policy_at_step: int | None = None
+    # what the policy is given to see of the cue; observers get what was rendered
     cue_view: CueViewSettings = AS_SHOWN
 
 

@@ -59,24 +59,16 @@ class EnvSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PolicySpec:
-    """What a policy reads and what it returns.
+    """What a policy reads and what it returns."""
 
-    Attributes:
-        name: for messages.
-        reads: `last` if only the newest frame matters (the frames between two inferences are then
-            not rendered), `every` if the policy must see each control step.
-        cameras: the cameras it needs; empty means that nothing is ever rendered for it.
-        states: the proprioceptive vectors it needs.
-        chunk_size: how many actions one inference gives.
-        privileged: whether it reads the true state of the world (scripted controls only).
-    """
-
-    name: str
+    name: str  # for messages
+    # `last` if only the newest frame matters (the frames between two inferences are then not rendered),
+    # `every` if the policy must see each control step
     reads: Literal["last", "every"]
-    cameras: tuple[str, ...]
-    states: tuple[str, ...]
-    chunk_size: int
-    privileged: bool = False
+    cameras: tuple[str, ...]  # the cameras it needs; empty means that nothing is ever rendered for it
+    states: tuple[str, ...]  # the proprioceptive vectors it needs
+    chunk_size: int  # how many actions one inference gives
+    privileged: bool = False  # whether it reads the true state of the world (scripted controls only)
 
     def is_given(self, step: int, next_inference_step: int, *, horizon_steps: int) -> bool:
         """Whether the policy will be given the observation at `step`: nothing after the last inference is."""

@@ -34,18 +34,13 @@ class CueFrames(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SweepRow:
-    """One row.
-
-    Attributes:
-        comparison: with its reference; None for the reference itself. Holm's correction is over the table.
-        cue: frames of the cue that the policy got.
-        n_to_settle: episodes that would detect the given difference, at the level corrected for the number
-            of comparisons (Bonferroni, which Holm's method requires for its smallest p).
-    """
+    """One row, compared with its reference."""
 
     evidence: Evidence
-    comparison: Comparison | None
+    comparison: Comparison | None  # None for the reference itself; Holm's correction is over the table
     cue: CueFrames | None
+    # episodes that would detect the given difference, at the level corrected for the number of comparisons
+    # (Bonferroni, which Holm's method requires for its smallest p)
     n_to_settle: int | None
 
     @property

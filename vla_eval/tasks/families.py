@@ -12,20 +12,12 @@ from vla_eval.tasks.spec import TaskSpec
 
 
 class Family(NamedTuple):
-    """How a family is made.
-
-    Attributes:
-        id: its name.
-        row: id of the row of the catalogue that it is made from.
-        open_arguments: required arguments; everything else is as in the row.
-        min_response_steps: see `TaskSpec`. Chosen such that with the arguments of any row of the family
-            the horizon is that row's.
-    """
+    """How a family is made."""
 
     id: str
-    row: str
-    open_arguments: tuple[str, ...]
-    min_response_steps: int
+    row: str  # id of the row of the catalogue that it is made from
+    open_arguments: tuple[str, ...]  # required arguments; everything else is as in the row
+    min_response_steps: int  # as in `TaskSpec`; with the arguments of any row the horizon is that row's
 
 
 FAMILY_TABLE = (
@@ -50,18 +42,17 @@ FAMILY_TABLE = (
 
 def make_families(rows: Mapping[str, TaskSpec]) -> dict[str, TaskSpec]:
     """Return family id -> its row, made from the rows of the catalogue."""
-    return {family.id: _make_family(family, rows[family.row]) for family in FAMILY_TABLE}
-
-
-def _make_family(family: Family, row: TaskSpec) -> TaskSpec:
-    is_open = bool(family.open_arguments)
-    return replace(
-        row,
-        id=family.id,
-        kwargs={name: value for name, value in row.kwargs.items() if name not in family.open_arguments},
-        description=f"{row.description} Numbers as the arguments say." if is_open else row.description,
-        chance_success=None if is_open else row.chance_success,
-        seen_in_one_frame=None if is_open else row.seen_in_one_frame,  # speeds are known by the row alone
-        open_arguments=family.open_arguments,
-        min_response_steps=family.min_response_steps,
-    )
+    families = {}
+    for family in FAMILY_TABLE:
+        row, is_open = rows[family.row], bool(family.open_arguments)
+        families[family.id] = replace(
+            row,
+            id=family.id,
+            kwargs={name: value for name, value in row.kwargs.items() if name not in family.open_arguments},
+            description=f"{row.description} Numbers as the arguments say." if is_open else row.description,
+            chance_success=None if is_open else row.chance_success,
+            seen_in_one_frame=None if is_open else row.seen_in_one_frame,  # speeds: known by the row alone
+            open_arguments=family.open_arguments,
+            min_response_steps=family.min_response_steps,
+        )
+    return families

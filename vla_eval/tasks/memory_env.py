@@ -91,13 +91,10 @@ class MemoryTableEnv(TensorsOut):
 
     SUPPORTED_ROBOTS: tuple[str, ...] = tuple(WRIST_MESH_ROBOTS.values())
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
-    MAX_REWARD: float
     FAMILY: int
     """Number of the task family in random streams. Part of every result: never renumber, only add."""
     distract_steps = 0
     """In so many steps of the delay something else is shown, in tasks that take this as an argument."""
-    PROMPT_DIMS: tuple[str, ...] = ()
-    """Names of the numbers that specify the goal, if a sentence cannot; rad."""
     HUMAN_CAMERA_EYE: tuple[float, float, float] = (0.5, 1.0, 1.0)
     HUMAN_CAMERA_TARGET: tuple[float, float, float] = (-0.3, 0.0, 0.0)
 

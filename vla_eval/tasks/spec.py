@@ -39,74 +39,54 @@ MAX_CANDIDATES = 100
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskSpec:
-    """One row of the catalogue.
+    """One row of the catalogue."""
 
-    Attributes:
-        id: task id without namespace, `RememberColor3-v0`; the gym id is `vla_eval/<id>`.
-        version: raised when a change affects a success rate; recorded with each run.
-        entry_point: `module:Class` of the ManiSkill environment.
-        kwargs: arguments that make this row of its family; a user's arguments override them.
-        horizon_steps: number of control steps, at 20 Hz, after which the episode ends.
-        memory: the type of memory that it needs, according to the paper.
-        instruction_key: the task's name in `prompts/*.yaml`.
-        description: one sentence: the goal.
-        success: one sentence: the success rule.
-        oracle: `module:attribute` of the scripted expert.
-        oracle_sees: what the expert may see, and when it acts, in words.
-        turns_wrist: the expert turns the wrist, so that it needs a control mode with rotations.
-        candidates: the kind of the N objects among which the policy chooses; None if there is no choice, and
-            for an official task.
-        candidate_counts: argument -> its default; their product is N. Empty if there is no choice, or it is
-            not known to controls. A name that is not an argument of the task is a constant.
-        several_right: several candidates have to be touched; otherwise one is right.
-        seen_in_one_frame: what the control of single frames goes by: a ball that rolls (with the argument
-            `velocity_range_m_s`), or a cube dragged onto a disc whose colour is known.
-        chance_success: success rate of a perfect arm that ignores the cue; None if it has to be measured
-            (there is no choice among candidates), or depends on the arguments (families).
-        max_reward: the dense reward at success, by which `normalized_dense` divides.
-        idle_success: measured success rate of doing nothing; 0 for all tasks but a few.
-        cue_marks_place: the cue is shown where the right candidate will be.
-        shows_one_by_one: the cue is `n_shown` items one after another, each for `cue_steps`.
-        other_arms: values of `robot_uids` that it takes in addition to the Panda's.
-        open_arguments: arguments required to make a task of this row; empty except for a family.
-        suite: the set of tasks that it belongs to.
-        instruction: its sentence where no prompt set has one under `instruction_key`; a word in braces is
-            filled in by the environment, per episode.
-        phase_source, waits_for_choice: of an official task: which phases can be read from it, and whether the
-            official wrapper replaces actions by zeros until the choice.
-        true_state: of an official task: what scripted controls can be given of its true state.
-        min_response_steps: of a family: the horizon grows with cue and delay so that at least this many
-            steps remain for the response. None: the horizon is fixed by the id.
-    """
-
-    id: str
-    version: int
-    entry_point: str
+    id: str  # task id without namespace, `RememberColor3-v0`; the gym id is `vla_eval/<id>`
+    version: int  # raised when a change affects a success rate; recorded with each run
+    entry_point: str  # `module:Class` of the ManiSkill environment
+    # arguments that make this row of its family; a user's arguments override them
     kwargs: Mapping[str, Any] = field(default_factory=dict)
-    horizon_steps: int
-    memory: MemoryType
-    instruction_key: str
-    description: str
-    success: str
-    oracle: str
-    oracle_sees: str
+    horizon_steps: int  # number of control steps, at 20 Hz, after which the episode ends
+    memory: MemoryType  # the type of memory that it needs, according to the paper
+    instruction_key: str  # the task's name in `prompts/*.yaml`
+    description: str  # one sentence: the goal
+    success: str  # one sentence: the success rule
+    oracle: str  # `module:attribute` of the scripted expert
+    oracle_sees: str  # what the expert may see, and when it acts, in words
+    # the expert turns the wrist, so that it needs a control mode with rotations
     turns_wrist: bool = False
+    # the kind of the N objects among which the policy chooses; None if there is no choice, and for an
+    # official task
     candidates: str | None
+    # argument -> its default; their product is N. Empty if there is no choice, or it is not known to
+    # controls. A name that is not an argument of the task is a constant.
     candidate_counts: Mapping[str, int] = field(default_factory=dict)
-    several_right: bool = False
+    several_right: bool = False  # several candidates have to be touched; otherwise one is right
+    # what the control of single frames goes by: a ball that rolls (with the argument
+    # `velocity_range_m_s`), or a cube dragged onto a disc whose colour is known
     seen_in_one_frame: Literal["ball", "cube"] | None = None
+    # success rate of a perfect arm that ignores the cue; None if it has to be measured (there is no
+    # choice among candidates), or depends on the arguments (families)
     chance_success: float | None
-    max_reward: float
-    idle_success: float = 0.0
-    cue_marks_place: bool = False
-    shows_one_by_one: bool = False
-    other_arms: tuple[str, ...] = ()
+    max_reward: float  # the dense reward at success, by which `normalized_dense` divides
+    idle_success: float = 0.0  # measured success rate of doing nothing; 0 for all tasks but a few
+    cue_marks_place: bool = False  # the cue is shown where the right candidate will be
+    shows_one_by_one: bool = False  # the cue is `n_shown` items one after another, each for `cue_steps`
+    other_arms: tuple[str, ...] = ()  # values of `robot_uids` that it takes in addition to the Panda's
+    # arguments required to make a task of this row; empty except for a family
     open_arguments: tuple[str, ...] = ()
-    suite: Suite = "paper"
+    suite: Suite = "paper"  # the set of tasks that it belongs to
+    # its sentence where no prompt set has one under `instruction_key`; a word in braces is filled in by
+    # the environment, per episode
     instruction: str | None = None
+    # `phase_source`, `waits_for_choice`: of an official task: which phases can be read from it, and
+    # whether the official wrapper replaces actions by zeros until the choice
     phase_source: PhaseSource = "none"
     waits_for_choice: bool = False
+    # of an official task: what scripted controls can be given of its true state
     true_state: TrueState = "none"
+    # of a family: the horizon grows with cue and delay so that at least this many steps remain for the
+    # response. None: the horizon is fixed by the id.
     min_response_steps: int | None = None
 
     @property

@@ -22,12 +22,9 @@ class TensorsOut(ArmControl):
     """Turns what a task says in arrays into what ManiSkill's own `step` and `reset` return."""
 
     MAX_REWARD: float
-    PROMPT_DIMS: tuple[str, ...]
+    PROMPT_DIMS: tuple[str, ...] = ()
+    """Names of the numbers that specify the goal, if a sentence cannot; rad."""
     instruction: str | None
-
-    def read_info(self) -> Info:
-        """Return the info of the present step, (B, …) arrays by name; every array in it is a new one."""
-        raise NotImplementedError
 
     def extra_info(self) -> Info:
         """Return what only those read who step ManiSkill's environment itself, (B, …) arrays by name."""

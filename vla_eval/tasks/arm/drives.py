@@ -28,15 +28,11 @@ Vector = tuple[Number, Number, Number]
 
 
 class Drive(NamedTuple):
-    """What drives the joints of one controller, in two parts: arms that step together share the first.
+    """What drives the joints of one controller, in two parts: arms that step together share the first."""
 
-    Attributes:
-        goals: (N, D), this controller's part of the actions of N arms alike -> a goal for each.
-        reach: sets the targets of this arm's joints by a goal.
-    """
-
+    # (N, D), this controller's part of the actions of N arms alike -> a goal for each
     goals: Callable[[FloatArray], Iterable[Any]]
-    reach: Callable[[Any], None]
+    reach: Callable[[Any], None]  # sets the targets of this arm's joints by a goal
 
 
 ZERO, ONE = np.float32(0), np.float32(1)
