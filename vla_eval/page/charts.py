@@ -77,13 +77,20 @@ class Chart(NamedTuple):
     narrow: Markup | None = None
 
 
-def forest(bars: Sequence[Bar], *, title: str, description: str, label_px: float = 0) -> Chart:
+def forest(
+    bars: Sequence[Bar],
+    *,
+    title: str,
+    description: str,
+    width_px: float = FOREST_WIDTH_PX,
+    label_px: float = 0,
+) -> Chart:
     """Draw rates with intervals, one below the other, chance and ceiling as ticks."""
     label = f"{title}. {description}"
     with own_style():
         return Chart(
             title,
-            inline_svg(_forest(bars, FOREST_WIDTH_PX, label_px), label=label, css_class="wide"),
+            inline_svg(_forest(bars, width_px, label_px), label=label, css_class="wide"),
             inline_svg(_forest(bars, NARROW_FOREST_WIDTH_PX, label_px), label=label, css_class="narrow"),
         )
 
