@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 import torch
 
-from vla_eval.bench.serving import run_serving_bench, write_recipe
+from vla_eval.bench.serving import run_serving_bench
 from vla_eval.bench.serving_processes import Asker, context, make_in_process
 from vla_eval.cli.main import main
-from vla_eval.testing.serving_policies import StillPolicy, make_small_transformer, write_small_transformer
+from vla_eval.testing.looking_policy import write_recipe
+from vla_eval.testing.serving_policies import (
+    StillPolicy,
+    make_small_transformer,
+    make_still,
+    write_small_transformer,
+)
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +63,7 @@ class TestWhatIsMeasured:
         assert not np.array_equal(seen[0].images["base_camera"], seen[1].images["base_camera"])
 
     def test_a_recipe_of_the_bench_makes_its_policy(self, tmp_path: Path) -> None:
-        recipe = write_recipe(tmp_path / "still.yaml", "make_still")
+        recipe = write_recipe(tmp_path / "still.yaml", make_still)
 
         assert isinstance(make_in_process(recipe, n_rows=1), StillPolicy)
 

@@ -7,13 +7,13 @@ import pytest
 from vla_eval.data.recording.folder import RecordingFolder
 from vla_eval.errors import RecipeError
 from vla_eval.storage.run_file import RunDescription
-from vla_eval.storage.starting import FolderStart
+from vla_eval.storage.starting import StartedFolder
 
 OWN = ("run.json", "lock")
 
 
-def begin(folder: Path) -> FolderStart:
-    start = FolderStart(folder, own=OWN)
+def begin(folder: Path) -> StartedFolder:
+    start = StartedFolder(folder, own=OWN)
     (folder / "logs").mkdir(parents=True)
     (folder / "logs" / "worker-0.log").touch()
     (folder / "run.json").touch()

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from vla_eval.evaluation.plan import Plan
@@ -41,7 +42,8 @@ class ThreeMachines:
 
     def processes_of_machine(self) -> list[int]:
         raylet = self.nodes[-1].all_processes["raylet"][0].process.pid
-        return [raylet, *_descendants(raylet)]
+        below = psutil.Process(raylet).children(recursive=True)
+        return [raylet, *(process.pid for process in below)]
 
 
 def kill_actors(name: str) -> int:
@@ -61,18 +63,6 @@ def pids_of(title: str) -> list[int]:
         with contextlib.suppress(OSError):
             if path.read_bytes().startswith(title.encode()):
                 found.append(int(path.parent.name))
-    return found
-
-
-def _descendants(ancestor: int) -> list[int]:
-    children: dict[int, list[int]] = {}
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        with contextlib.suppress(OSError):
-            parent = int(path.read_text().rpartition(")")[2].split()[1])
-            children.setdefault(parent, []).append(int(path.parent.name))
-    found = list(children.get(ancestor, []))
-    for pid in found:
-        found += children.get(pid, [])
     return found
 
 

@@ -17,23 +17,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
-
 import vla_eval.bench.official_episodes as official_script
+from vla_eval.bench.parts import measure_parts
 from vla_eval.config.environment import EnvSettings
-from vla_eval.core import SimEnv
-from vla_eval.envs.factory import make_env
+from vla_eval.envs.factory import describe_env
 from vla_eval.errors import ConformanceError
 from vla_eval.lock.switch import own_need
 from vla_eval.storage.folders import EPISODES_FILE
-from vla_eval.testing.looking_policy import CAMERAS, write_looking
+from vla_eval.testing.looking_policy import make_looking, write_recipe
 from vla_eval.workers.children import bound_command, python_command
 from vla_eval.workers.guard import become_subreaper
 from vla_eval.workers.start import available_cores
 
 POLL_SECONDS = 0.02
-N_MEASURED = 40  # steps, and frames, of which the mean is taken
-N_RESETS = 5
 
 
 class Costs(NamedTuple):
@@ -111,7 +107,9 @@ def run_official_bench(
     Without one, our own eager loop is the baseline.
     """
     load = os.getloadavg()[0]
-    costs, horizon_steps = _costs(task)
+    step_ms, _, frame_ms, _, seen_reset_ms = (part.cpu_ms for part in measure_parts(task, repeats=1))
+    costs = Costs(step_ms, frame_ms, seen_reset_ms - frame_ms)
+    horizon_steps = describe_env(EnvSettings(task=task)).horizon_steps
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         if python is None:
@@ -165,7 +163,7 @@ class _Ran(NamedTuple):
 def _evaluation(task: str, folder: Path, name: str, k: int, n_episodes: int, *flags: str) -> _Ran:
     """Run an evaluation of the policy that reads both cameras, in a run folder of its own."""
     out = folder / name
-    policy = write_looking(folder / "looking.yaml")
+    policy = write_recipe(folder / "looking.yaml", make_looking)
     command = python_command("-m", "vla_eval.cli", "eval", "--task", task, "--policy", policy)
     command += ["--n-action-steps", str(k), "--episodes", str(n_episodes), "--out", str(out), *flags]
     become_subreaper()  # so that the CPU time of processes that outlive the command is counted
@@ -231,33 +229,3 @@ def _official(task: str, python: Path, n_episodes: int, horizon_steps: int) -> B
         cpu_seconds=found["cpu_seconds"][-1] - found["cpu_seconds"][0],
         start_seconds=seconds - running * n_episodes / (n_episodes - 1),
     )
-
-
-# ------------------------------------------------------------------------------------------ in this process
-
-
-def _costs(task: str) -> tuple[Costs, int]:
-    """Return the costs, and the length of an episode."""
-    env, blind = make_env(EnvSettings(task=task, cameras=CAMERAS)), make_env(EnvSettings(task=task))
-    try:
-        env.reset({0: 1}, render=True)  # starts the renderer and compiles its shaders
-        blind.reset({0: 1}, render=False)
-        _step_ms(env, render=True, n=2)
-        step, drawn = _step_ms(blind, render=False), _step_ms(env, render=True)
-        begun = time.process_time()
-        for seed in range(N_RESETS):
-            env.reset({0: 1 + seed}, render=True)
-        reset = 1000 * (time.process_time() - begun) / N_RESETS
-        return Costs(step, drawn - step, reset - (drawn - step)), env.spec.horizon_steps
-    finally:
-        env.close()
-        blind.close()
-
-
-def _step_ms(env: SimEnv, *, render: bool, n: int = N_MEASURED) -> float:
-    draws = np.random.default_rng(0)
-    begun = time.process_time()
-    for _ in range(n):
-        action = draws.uniform(-1, 1, 7).astype(np.float32)
-        env.step({0: action}, render=frozenset({0} if render else ()))
-    return 1000 * (time.process_time() - begun) / n

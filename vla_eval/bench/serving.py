@@ -4,7 +4,6 @@ Every figure is of one run on one machine. Servers and copies run one after the 
 its own, as in an evaluation.
 """
 
-import json
 import os
 import tempfile
 import time
@@ -13,9 +12,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+import psutil
 import torch
 
 from vla_eval.bench.serving_processes import (
@@ -25,14 +25,13 @@ from vla_eval.bench.serving_processes import (
     free_device_bytes,
     make_in_process,
     measure_copies,
-    resident_bytes,
     serving,
     taken_bytes,
 )
 from vla_eval.core import FloatArray
-from vla_eval.testing.serving_policies import write_small_transformer
+from vla_eval.testing.looking_policy import write_recipe
+from vla_eval.testing.serving_policies import make_small_transformer, make_still, write_small_transformer
 
-ADAPTERS = "vla_eval.testing.serving_policies"
 N_COMPARED = 4  # inferences per episode whose actions are compared
 MIN_LATENCIES = 20
 SMALL = "small transformer"
@@ -97,13 +96,12 @@ def run_serving_bench(
     """
     with tempfile.TemporaryDirectory() as scratch:
         folder, n_parameters = Path(scratch), None
-        still = write_recipe(folder / "still.yaml", "make_still")
+        still = write_recipe(folder / "still.yaml", make_still)
         served = policy
         if served is None:
             n_parameters = write_small_transformer(folder / "small")
-            served = write_recipe(
-                folder / "small.yaml", "make_small_transformer", checkpoint=str(folder / "small")
-            )
+            small = str(folder / "small")
+            served = write_recipe(folder / "small.yaml", make_small_transformer, checkpoint=small)
         load = os.getloadavg()[0]
         direct, behind, n_latencies = _latencies(still, seconds)
         rows = [_row(served, n, seconds, compiles=compiles) for n in sessions]
@@ -121,13 +119,6 @@ def run_serving_bench(
             rounding=tuple(_rounding(served, max(sessions), precision) for precision in precisions),
             compilation=rows[-1][1],
         )
-
-
-def write_recipe(path: Path, adapter: str, **args: Any) -> str:
-    """Write the recipe of a policy that is made for measuring; return its path."""
-    recipe = {"version": 1, "description": "of a bench", "adapter": f"{ADAPTERS}:{adapter}", "args": args}
-    path.write_text(json.dumps(recipe))  # JSON is YAML
-    return str(path)
 
 
 def _latencies(policy: str, seconds: float) -> tuple[Percentiles, Percentiles, int]:
@@ -185,7 +176,7 @@ def _served_rate(server: Server, n_sessions: int, seconds: float, free_before: i
             begun = time.perf_counter()
             n_asked = sum(pool.map(ask_until, askers, repeat(begun + seconds)))
         elapsed = time.perf_counter() - begun
-        resident, on_device = resident_bytes(server.pid), taken_bytes(free_before)
+        resident, on_device = psutil.Process(server.pid).memory_info().rss, taken_bytes(free_before)
     finally:
         for policy in policies:
             policy.close()

@@ -8,11 +8,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.synchronize import Barrier
-from pathlib import Path
 from queue import Empty
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 
 from vla_eval.chunking import ChunkingSpec
@@ -34,7 +34,6 @@ STATE_SIZES = {"tcp_pose": 7, "qpos": 9, "qvel": 9}
 START_SECONDS = 900.0  # importing torch, and loading the weights
 STOP_SECONDS = 30.0
 REPLY_SECONDS = 300.0
-KIB = 1024
 SERVING = re.compile(r"at (ws://\S+)")
 
 
@@ -195,17 +194,8 @@ def _infer_alone(policy: str, seconds: float, seed: int, barrier: Barrier, resul
     while (elapsed := time.perf_counter() - begun) < seconds:
         asker.ask()
         n += 1
-    results.put((n / elapsed, resident_bytes("self")))
+    results.put((n / elapsed, psutil.Process().memory_info().rss))
     time.sleep(START_SECONDS)  # until it is ended: the memory of all is measured while all are there
-
-
-def resident_bytes(pid: int | str) -> int:
-    """Return the resident memory of a process."""
-    text = Path(f"/proc/{pid}/status").read_text()
-    found = re.search(r"^VmRSS:\s+(\d+) kB", text, re.MULTILINE)
-    if found is None:
-        raise OSError(f"/proc/{pid}/status has no VmRSS: the process has ended")
-    return KIB * int(found.group(1))
 
 
 def free_device_bytes() -> int | None:

@@ -168,7 +168,7 @@ def refused(path: Path, expected: str, found: str) -> DatasetError:
 def _check_size(path: Path, metadata: Any) -> None:  # Any: pyarrow's
     needed = sum(metadata.row_group(index).total_byte_size for index in range(metadata.num_row_groups))
     free = available_ram_bytes()
-    if free is not None and needed > free:
+    if needed > free:
         raise DatasetError(
             f"{path}: takes {needed / MIB:.0f} MiB of memory, and {free / MIB:.0f} MiB are free. Select "
             "fewer episodes, or use a machine with more."

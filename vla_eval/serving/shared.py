@@ -99,7 +99,7 @@ class SharedServers:
     def one_has_ended(self) -> bool:
         """Whether a server is there no longer; asked after an error of a connection."""
         deadline = time.monotonic() + NOTICE_SECONDS
-        while not any(service.has_ended() for service in self._services):
+        while not any(service.wait(0.0) is not None for service in self._services):
             if time.monotonic() > deadline:
                 return False
             time.sleep(POLL_SECONDS)

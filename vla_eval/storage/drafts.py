@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vla_eval.errors import VlaEvalError
 from vla_eval.lock.switch import let_write
-from vla_eval.storage.durable import on_disk, sync_folder, sync_tree
+from vla_eval.storage.durable import on_disk, sync_path, sync_tree
 
 DRAFT_SUFFIX = ".draft"
 NO_LINKS = frozenset({errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP, errno.ENOSYS})
@@ -50,7 +50,7 @@ def publish(draft: Path, path: Path) -> None:
     """Make a folder durable and give it its final name, in one step that cannot be cut in half."""
     sync_tree(draft)
     os.rename(draft, path)
-    sync_folder(path.parent)
+    sync_path(path.parent)
 
 
 @contextlib.contextmanager

@@ -18,7 +18,7 @@ from typing import NamedTuple, Self
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeKey, EpisodeRecord, EpisodeTiming
 from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device
-from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder
+from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_path
 from vla_eval.storage.episodes_file import parse_records, repair_records, shown_key
 from vla_eval.storage.folders import (
     EPISODES_FILE,
@@ -93,7 +93,7 @@ class RunFolder:
         self._run_file.save(path)
         self._episodes: LineFile | None = LineFile(path / EPISODES_FILE, durable=True)
         self._timings = LineFile(path / TIMINGS_FILE, durable=False)
-        sync_folder(path)
+        sync_path(path)
 
     @classmethod
     def open(
@@ -134,7 +134,7 @@ class RunFolder:
     ) -> None:
         """Close the folder; a new one is removed if an error came before its first episode."""
         if isinstance(exc, Exception) and self._started is not None and not self._has_lines:
-            self._started.start.undo()
+            self._started.undo()
         self.close()
 
     def finished_keys(self) -> frozenset[EpisodeKey]:
@@ -215,7 +215,7 @@ class RunFolder:
             self._timings.close()
             self._episodes = None
         if self._started is not None:
-            self._started.lock.release()
+            self._started.leave(failed=False)
             self._started = None
 
     def _load(self, description: RunDescription) -> RunFile:

@@ -5,7 +5,6 @@ import logging
 import os
 import shutil
 from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.errors import RunFolderError
@@ -17,14 +16,26 @@ logger = logging.getLogger(__name__)
 LOGS_FOLDER = "logs"
 
 
-class FolderStart:
-    """What a start finds at its place, noted before it makes anything there; it writes the files of `own`."""
+class StartedFolder:
+    """A folder that this process makes or finds, and locks; the start writes the files of `own` into it."""
 
     def __init__(self, path: Path, *, own: Collection[str]) -> None:
         self._path = path
         self._own = frozenset(own)
         self._made = [folder for folder in (path, *path.parents) if not folder.exists()]
         self._before = frozenset(os.listdir(path)) if path.is_dir() else frozenset[str]()
+        self._lock: FolderLock | None = None
+
+    def lock(self, file: str) -> None:
+        """Keep other processes out; a `FolderInUseError` if one is in it."""
+        self._lock = FolderLock(self._path / file)
+
+    def leave(self, *, failed: bool) -> None:
+        """Let others in; what is new is removed if nothing came of it."""
+        if failed:
+            self.undo()
+        if self._lock is not None:
+            self._lock.release()
 
     def undo(self) -> None:
         """Remove what the start has made; nothing, if there is anything that it does not know."""
@@ -52,20 +63,6 @@ class FolderStart:
             folder.rmdir()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StartedFolder:
-    """A folder that this process has made or found, and locked."""
-
-    start: FolderStart
-    lock: FolderLock
-
-    def leave(self, *, failed: bool) -> None:
-        """Let others in; what is new is removed if nothing came of it."""
-        if failed:
-            self.start.undo()
-        self.lock.release()
-
-
 @contextlib.contextmanager
 def starting(
     path: Path,
@@ -82,10 +79,10 @@ def starting(
     """
     let_write(path)
     try:
-        start = FolderStart(path, own=own)
+        started = StartedFolder(path, own=own)
         check(path)
         path.mkdir(parents=True, exist_ok=True)
-        started = StartedFolder(start=start, lock=FolderLock(path / lock_file))
+        started.lock(lock_file)
         try:
             yield started
         except BaseException:

@@ -1,8 +1,9 @@
 """A policy to measure rendering with: it reads both cameras and acts at random, so all cost is elsewhere."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any  # arguments of an adapter
 
 import numpy as np
 
@@ -36,8 +37,9 @@ def make_looking(context: PolicyContext) -> LookingPolicy:
     return LookingPolicy(context.chunking.n_action_steps, CAMERAS)
 
 
-def write_looking(path: Path) -> str:
-    """Write the recipe of the policy; return its path."""
-    adapter = f"{__name__}:{make_looking.__name__}"
-    path.write_text(json.dumps({"version": 1, "description": "looks, acts at random", "adapter": adapter}))
-    return str(path)  # JSON is YAML
+def write_recipe(path: Path, make: Callable[..., object], **args: Any) -> str:
+    """Write the recipe of a policy that is made for measuring, by its adapter; return its path."""
+    adapter = f"{make.__module__}:{make.__name__}"
+    recipe = {"version": 1, "description": "of a bench", "adapter": adapter, "args": args}
+    path.write_text(json.dumps(recipe))  # JSON is YAML
+    return str(path)

@@ -68,7 +68,7 @@ def rehearse(name: str, options: RehearsalOptions, *, batches: Sequence[int] = (
         shutil.rmtree(options.folder)
 
 
-def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Sequence[int] = ()) -> Rehearsed:
+def rehearse_checkpoint(path: Path, options: RehearsalOptions) -> Rehearsed:
     """Load a checkpoint or a run, and let it act; `device` and `dtype` are used of the options."""
     reset_peak()
     before, folder = peak_rss_bytes(), find_checkpoint(path)
@@ -79,7 +79,7 @@ def rehearse_checkpoint(path: Path, options: RehearsalOptions, *, batches: Seque
         )
     config = read_config(folder, LoadOptions(device=options.device, dtype=options.dtype))
     estimated = _estimate(make_unfilled_policy(config), options.device, before, trained=None)
-    return _measured(_Loading(str(path), folder, config, options), before, estimated, batches)
+    return _measured(_Loading(str(path), folder, config, options), before, estimated, batches=())
 
 
 def _rehearse(
@@ -125,7 +125,7 @@ def _measured(one: _Loading, before: int, estimated: Estimated, batches: Sequenc
     n_bytes = (one.folder / WEIGHTS_FILE).stat().st_size
     limit, device = limit_bytes(n_bytes), one.options.device
     available = available_ram_bytes()
-    if device == "cpu" and available is not None and available < limit:
+    if device == "cpu" and available < limit:
         raise CheckpointError(
             f"expected {limit / GB:.1f} GB of memory for this model, found {available / GB:.1f} GB "
             "available. Close other programs, or rehearse it on another machine."

@@ -150,8 +150,6 @@ def _tokenizer(named: Mapping[str, str], *, n_tokens: int | None = None) -> Any:
     tokenizer.train_from_iterator(CORPUS, trainer)
     if n_tokens is not None:
         # `add_tokens` takes minutes for 250,000.
-        from tokenizers import models
-
         model = json.loads(tokenizer.to_str())["model"]
         vocabulary = model["vocab"] | {f"<{index}>": index for index in range(len(model["vocab"]), n_tokens)}
         merges = [tuple(pair) for pair in model["merges"]]

@@ -5,12 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.config.finetuning import FinetuneConfig
+from vla_eval.workers.jobs import Job
 
 RUNNER = "vla_eval.training.worker:FinetuneRunner"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FinetuneJob:
+class FinetuneJob(Job):
     """One fine-tuning; `command` is what the user typed, `name` what messages call it."""
 
     config: FinetuneConfig
@@ -21,11 +22,6 @@ class FinetuneJob:
     def setup_key(self) -> Hashable:
         """See `workers.Job`: each has a process of its own."""
         return self.config.out
-
-    @property
-    def n_items(self) -> int:
-        """One fine-tuning."""
-        return 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

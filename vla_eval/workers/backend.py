@@ -59,9 +59,6 @@ class Service(Protocol):
             BrokenMessageError: what has come is not a message.
         """
 
-    def has_ended(self) -> bool:
-        """Whether it is there no longer."""
-
     def wait(self, seconds: float) -> int | None:
         """Wait for its end; return its exit code if there is one."""
 

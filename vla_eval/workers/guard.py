@@ -16,6 +16,8 @@ import traceback
 from collections.abc import Iterator
 from multiprocessing.connection import Connection
 
+import psutil
+
 ASK_WHERE = b"?"
 """Sent by the parent: the worker writes the stack of every thread to its log."""
 END = b"e"
@@ -96,28 +98,14 @@ def end_descendants() -> None:
     """Kill all descendants of this process, which must be a subreaper; wait until they are gone."""
     deadline, pause_seconds = time.monotonic() + REAP_SECONDS, 0.001
     while True:
-        for pid in _descendants(os.getpid()):
-            with contextlib.suppress(ProcessLookupError, PermissionError):  # gone, or another user's
-                os.kill(pid, signal.SIGKILL)
+        for process in psutil.Process().children(recursive=True):
+            with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):  # gone, or another user's
+                process.kill()
         list(_reaped())
         if not _has_children() or time.monotonic() > deadline:
             return
         time.sleep(pause_seconds)
         pause_seconds = min(2 * pause_seconds, 0.05)
-
-
-def _descendants(ancestor: int) -> list[int]:
-    children: dict[int, list[int]] = {}
-    for name in os.listdir("/proc"):
-        if name.isdigit():
-            with contextlib.suppress(OSError), open(f"/proc/{name}/stat", "rb") as file:
-                # pid (name) state ppid …; the name may hold anything, parentheses too
-                parent = int(file.read().rpartition(b")")[2].split()[1])
-                children.setdefault(parent, []).append(int(name))
-    found = list(children.get(ancestor, []))
-    for pid in found:
-        found += children.get(pid, [])
-    return found
 
 
 def _reaped() -> Iterator[tuple[int, int]]:

@@ -19,6 +19,7 @@ class Job(Protocol):
     @property
     def n_items(self) -> int:
         """How many of what progress counts it has: the episodes of a batch, for example."""
+        return 1
 
 
 class JobSource[J: Job](Protocol):

@@ -18,10 +18,6 @@ class LocalService(WorkerProcess):
     address = LOOPBACK
     gpu: str | None = None
 
-    def has_ended(self) -> bool:
-        """Whether the process is there no longer."""
-        return self.wait(0.0) is not None
-
 
 @dataclass(frozen=True, slots=True)
 class LocalBackend:

@@ -16,8 +16,9 @@ from concurrent.futures import Future
 from multiprocessing import forkserver, resource_tracker, spawn
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerContext, SpawnContext, SpawnProcess
-from pathlib import Path
 from typing import Any  # private parts of multiprocessing
+
+import psutil
 
 from vla_eval.config.environment import Simulator
 from vla_eval.lock.switch import WRITING_VARIABLE, folders_for_workers, lock
@@ -114,13 +115,9 @@ def begin(
 def server_is_stopped() -> bool:
     """Whether the process that workers are forked from was stopped by a signal: it would never answer."""
     pid = _server_pid()
-    if pid is None:
-        return False
-    try:
-        with open(f"/proc/{pid}/stat", "rb") as file:
-            return file.read().rpartition(b")")[2].split()[0] == b"T"  # pid (name) state …
-    except OSError:
-        return False
+    with contextlib.suppress(psutil.Error):
+        return pid is not None and psutil.Process(pid).status() == psutil.STATUS_STOPPED
+    return False
 
 
 def end_server() -> None:
@@ -211,14 +208,9 @@ def available_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def available_ram_bytes() -> int | None:
-    """Return how much RAM a process may still take without swapping, where Linux says so."""
-    try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
-    except OSError:
-        return None
-    kib = [int(line.split()[1]) for line in lines if line.startswith("MemAvailable:")]
-    return kib[0] * 1024 if kib else None
+def available_ram_bytes() -> int:
+    """Return how much RAM a process may still take without swapping."""
+    return int(psutil.virtual_memory().available)
 
 
 def visible_gpus() -> tuple[str, ...]:

@@ -153,7 +153,7 @@ def decode_camera(source: FrameSource, camera: str) -> Iterator[ImageArray]:
 def frames_in_ram(source: FrameSource) -> dict[str, ImageArray]:
     """Decode all frames into this process's RAM, or raise `DatasetError`."""
     free = available_ram_bytes()
-    if free is not None and source.n_bytes + HEADROOM_BYTES > free:
+    if source.n_bytes + HEADROOM_BYTES > free:
         raise DatasetError(
             f"{_decoded_size(source)}, but {free / MIB:.0f} MiB of RAM are free. "
             f"Use storage='disk' (a memory map), or select fewer episodes."

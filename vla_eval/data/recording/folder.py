@@ -24,7 +24,7 @@ from vla_eval.data.recording.jobs import Origin
 from vla_eval.errors import DatasetError, RunFolderError
 from vla_eval.lock.switch import let_write
 from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device, without_device
-from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_folder, whole_lines
+from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_path, whole_lines
 from vla_eval.storage.folders import other_files
 from vla_eval.storage.run_file import RUN_FILE, RunDescription, RunFile
 from vla_eval.storage.starting import StartedFolder, starting
@@ -64,7 +64,7 @@ class RecordingFolder:
                 state, description, shown=out, allow_environment_change=allow_environment_change
             )
             run_file.save(state)
-            sync_folder(out)
+            sync_path(out)
         return cls(out, started, run_file)
 
     def __enter__(self) -> Self:

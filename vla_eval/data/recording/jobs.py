@@ -12,6 +12,7 @@ from vla_eval.data.manifest import FailedSeed
 from vla_eval.data.recording.demonstrations import SLOT, Attempt
 from vla_eval.evaluation.episode_jobs import EpisodeGroup
 from vla_eval.storage.run_file import JsonValue
+from vla_eval.workers.jobs import Job
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,8 +42,8 @@ class TaskPlan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _TaskJob:
-    """A job of one task; see `workers.Job`."""
+class _TaskJob(Job):
+    """A job of one task."""
 
     plan: TaskPlan
 
@@ -50,10 +51,6 @@ class _TaskJob:
     def setup_key(self) -> Hashable:
         """Jobs of one class share an environment."""
         return (self.plan.task, type(self))
-
-    @property
-    def n_items(self) -> int:
-        return 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

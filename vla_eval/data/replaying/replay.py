@@ -30,7 +30,7 @@ from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.workers.backend import Backend, Pool
 from vla_eval.workers.inside import RunnerClass
-from vla_eval.workers.jobs import Answered, JobList
+from vla_eval.workers.jobs import Answered, Job, JobList
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerSpec
@@ -42,7 +42,7 @@ MACHINE_FACTS = ("packages", "python", "platform", "cpu", "mesa", "nvidia_driver
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ReplayJob:
+class ReplayJob(Job):
     """One episode to replay; `device` is the one that rendered the recording's images."""
 
     dataset: Path
@@ -56,11 +56,6 @@ class ReplayJob:
     def setup_key(self) -> Hashable:
         """See `workers.Job`."""
         return (self.dataset, self.pixels)
-
-    @property
-    def n_items(self) -> int:
-        """One episode."""
-        return 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

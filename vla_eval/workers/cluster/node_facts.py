@@ -1,7 +1,6 @@
 """What a machine of a cluster has, found on that machine; and whether it can be used with this one."""
 
 import contextlib
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -58,7 +57,7 @@ def node_facts(needs: tuple[Needed, ...] = (), *, folder: str = ".") -> NodeFact
     return NodeFacts(
         environment=collect_environment(),
         vulkan=vulkan_drivers(),
-        free_bytes=available_ram_bytes() or os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"),
+        free_bytes=available_ram_bytes(),
         n_gpus=len(visible_gpus()),
         missing=missing,
         absent=absent,

@@ -93,10 +93,6 @@ class ClusterService:
                     self._busy = _Busy(at, seconds)
         return self._share
 
-    def has_ended(self) -> bool:
-        """Whether it is there no longer."""
-        return self.wait(0.0) is not None
-
     def wait(self, seconds: float) -> int | None:
         """Wait for its end; return its exit code if there is one."""
         if self._closing is not None:
