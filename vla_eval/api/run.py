@@ -89,13 +89,7 @@ class Run:
         table = build_table(self.stored, baseline=baseline)
         return Text(
             render(
-                table,
-                format,
-                columns=columns,
-                wide=wide,
-                preset=preset,
-                paper=paper,
-                published=published,
+                table, format, columns=columns, wide=wide, preset=preset, paper=paper, published=published
             ),
             format,
         )

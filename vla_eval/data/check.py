@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any  # lerobot is untyped
+from typing import Any, NamedTuple  # lerobot is untyped
 
 import numpy as np
 from av.error import FFmpegError
@@ -31,8 +31,7 @@ STATISTICS = ("min", "max", "mean", "std")
 STATISTICS_TOLERANCE = 1e-3  # relative; lerobot computes in float32
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Said:
+class Said(NamedTuple):
     """One line of the report."""
 
     answer: Answer
@@ -55,14 +54,6 @@ class CheckReport:
         return any(one.answer == "refused" for one in self.said)
 
 
-def _refused(sentence: str) -> Said:
-    return Said(answer="refused", sentence=sentence)
-
-
-def _kept(sentence: str) -> Said:
-    return Said(answer="kept", sentence=sentence)
-
-
 def check(path: Path) -> CheckReport:
     """Look at all of a dataset but the pixels.
 
@@ -79,7 +70,7 @@ def check(path: Path) -> CheckReport:
     if facts is not None or has_our_fields(dataset.meta.features):
         known: Iterable[Said] = _breaches(demonstrations)
         if facts is not None and facts.is_checked:  # the rules were applied when it was made
-            known = map(_kept, facts.kept)
+            known = (Said("kept", sentence) for sentence in facts.kept)
         kind = "a LeRobotDataset with the fields of this project, without its records"
         return CheckReport(
             path=path,
@@ -92,7 +83,7 @@ def check(path: Path) -> CheckReport:
     try:
         report = _of_source(lerobot_source(dataset), kind)
     except DatasetError as exc:
-        said = (*found, _refused(str(exc)), *_breaches(demonstrations))
+        said = (*found, Said("refused", str(exc)), *_breaches(demonstrations))
         return CheckReport(path=path, kind=kind, demonstrations=demonstrations, said=said, next_step="")
     return dataclasses.replace(report, said=(*found, *report.said))
 
@@ -141,9 +132,9 @@ def has_our_fields(features: Any) -> bool:  # Any: lerobot's plain data
 def _of_source(source: Source, kind: str) -> CheckReport:
     path = source.path
     demonstrations = source.demonstrations(expected_px=IMAGE_SIZE_PX)
-    said = [_kept(f"{remark}.") for remark in source.remarks]
+    said = [Said("kept", f"{remark}.") for remark in source.remarks]
     if source.left_out:
-        said.append(_kept(f"A conversion leaves out {', '.join(source.left_out)}."))
+        said.append(Said("kept", f"A conversion leaves out {', '.join(source.left_out)}."))
     return CheckReport(
         path=path,
         kind=kind or f"{len(source.files)} npz files",
@@ -162,7 +153,7 @@ def require_checked(dataset: OpenDataset) -> None:
 
 def _breaches(demonstrations: Demonstrations) -> Iterator[Said]:
     for one in find_breaches(demonstrations):
-        yield Said(answer=one.rule.answer, sentence=str(one))
+        yield Said(one.rule.answer, str(one))
 
 
 def check_videos(dataset: LocalDataset) -> Iterator[Said]:
@@ -177,16 +168,18 @@ def check_videos(dataset: LocalDataset) -> Iterator[Said]:
                 stream = container.streams.video[0]
                 size, n_frames, fps = (stream.height, stream.width), stream.frames, stream.average_rate
         except (FFmpegError, LookupError) as exc:
-            yield _refused(f"{path}: cannot be read as a video ({exc!s:.100}).")
+            yield Said("refused", f"{path}: cannot be read as a video ({exc!s:.100}).")
             continue
         expected = channels_first(meta.features[camera])[1:]
         if size != expected:
             found = f"{size[0]} × {size[1]} px, expected {expected[0]} × {expected[1]}"
-            yield _refused(f"{path}: its frames are {found} (meta/info.json).")
+            yield Said("refused", f"{path}: its frames are {found} (meta/info.json).")
         if n_frames < needed:
-            yield _refused(f"{path}: has {n_frames} frames, its {len(numbers)} episodes need {needed}.")
+            yield Said(
+                "refused", f"{path}: has {n_frames} frames, its {len(numbers)} episodes need {needed}."
+            )
         if fps != meta.fps:
-            yield _refused(f"{path}: has {fps} frames per second, expected {meta.fps}.")
+            yield Said("refused", f"{path}: has {fps} frames per second, expected {meta.fps}.")
 
 
 def _statistics(dataset: LocalDataset, demonstrations: Demonstrations) -> Iterator[Said]:
@@ -207,7 +200,8 @@ def _statistics(dataset: LocalDataset, demonstrations: Demonstrations) -> Iterat
                 differing.append(f"{kind} of {name}")
                 break
     if differing:
-        yield _kept(
+        yield Said(
+            "kept",
             f"meta/stats.json differs from the rows: {', '.join(differing)}. `dataset adopt` and "
-            "`dataset convert` compute it again."
+            "`dataset convert` compute it again.",
         )

@@ -80,7 +80,6 @@ def evaluation_effort(
     inferences = [
         math.ceil(n_steps / job.group.key.n_action_steps) for job, n_steps in zip(ahead, steps, strict=True)
     ]
-    checkpoints = _checkpoints(plan)
     reads = images_read(resolved.policies)
     rendered = [
         n_rendered(job, config, reads=reads[job.group.part], n_steps=n_steps)
@@ -95,7 +94,7 @@ def evaluation_effort(
         n_learned_inferences=sum(learned),
         n_frames=N_CAMERAS * sum(rendered),
         n_workers=worker_count(resolved, plan, n_jobs=queue.n_batches),
-        copies={policy: _n_bytes(folder) for policy, folder in checkpoints.items()},
+        copies=_bytes_of_weights(plan),
         warnings=tuple(plan.warnings),
         notes=tuple(plan.notes),
     )
@@ -134,15 +133,11 @@ def _lines(resolved: ResolvedEvaluation, effort: EvaluationEffort, rates: Assume
     )
 
 
-def _checkpoints(plan: Plan) -> dict[str, Path]:
+def _bytes_of_weights(plan: Plan) -> dict[str, int]:
     named = {job.group.part: job.group.args.get(LEARNED) for job in plan.jobs}
-    return {policy: find_checkpoint(Path(str(path))) for policy, path in named.items() if path is not None}
-
-
-def _n_bytes(folder: Path) -> int:
-    file = weights_file(folder)
-    assert file is not None  # `find_checkpoint` looks for it
-    return file.stat().st_size
+    paths = {policy: Path(str(path)) for policy, path in named.items() if path is not None}
+    files = {policy: weights_file(find_checkpoint(path)) for policy, path in paths.items()}
+    return {policy: file.stat().st_size for policy, file in files.items() if file is not None}
 
 
 Reads = Literal["none", "last", "every"]

@@ -109,9 +109,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     prompts = load_prompts(config.prompt_set)
     servers = {policy.name: policy.server for policy in policies if policy.server is not None}
     shared = resolved.shared
-    groups, left_out = _groups_of_all(
-        config, tasks, policies, prompts=prompts, servers=servers, shared=shared
-    )
+    groups, left_out = _groups_of_all(config, tasks, policies, prompts=prompts, shared=shared)
     _check_chunks(config, policies)
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
@@ -153,7 +151,6 @@ def _groups_of_all(
     policies: Sequence[PolicyEntry],
     *,
     prompts: Recipe[PromptRecipe],
-    servers: Mapping[str, ServerMetadata],
     shared: Mapping[str, str],
 ) -> tuple[list[EpisodeGroup], list[str]]:
     """Return the groups of every task and policy that make sense together, and which pairs are left out."""
@@ -176,8 +173,7 @@ def _groups_of_all(
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
                 continue
             n_rows = config.inference_max_batch if policy.part(0) in shared else config.slots_per_worker
-            server = servers.get(policy.name)
-            groups.extend(_groups(config, task, policy, server, on_task, n_rows=n_rows))
+            groups.extend(_groups(config, task, policy, on_task, n_rows=n_rows))
     return groups, left_out
 
 
@@ -318,9 +314,7 @@ def _runs(config: EvalConfig, group: EpisodeGroup) -> Sequence[int]:
 
 
 def _recipe_hashes(
-    prompts: Recipe[PromptRecipe],
-    policies: Sequence[PolicyEntry],
-    servers: Mapping[str, ServerMetadata],
+    prompts: Recipe[PromptRecipe], policies: Sequence[PolicyEntry], servers: Mapping[str, ServerMetadata]
 ) -> dict[str, str]:
     """Return the digests of all files that results depend on, see `Plan`."""
     hashes = {f"prompts/{prompts.name}": prompts.sha256}
@@ -365,14 +359,9 @@ def _refuse_doubles(kind: str, names: list[str]) -> None:
 
 
 def _groups(
-    config: EvalConfig,
-    task: TaskSpec,
-    policy: PolicyEntry,
-    server: ServerMetadata | None,
-    on_task: partial[EpisodeGroup],
-    *,
-    n_rows: int,
+    config: EvalConfig, task: TaskSpec, policy: PolicyEntry, on_task: partial[EpisodeGroup], *, n_rows: int
 ) -> Iterable[EpisodeGroup]:
+    server = policy.server
     for n_action_steps, (index, recipe) in product(_steps(config, policy), enumerate(policy.recipes)):
         args = recipe.value.args
         if server is not None:

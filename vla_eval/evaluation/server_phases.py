@@ -58,12 +58,7 @@ class ReadyPhase:
 
 @contextlib.contextmanager
 def with_servers(
-    phase: Phase,
-    resolved: ResolvedEvaluation,
-    plan: Plan,
-    *,
-    logs: Path,
-    stops: Callable[[], bool],
+    phase: Phase, resolved: ResolvedEvaluation, plan: Plan, *, logs: Path, stops: Callable[[], bool]
 ) -> Iterator[ReadyPhase | None]:
     """Give a phase as workers get it, with its servers; None if `stops` says so meanwhile."""
     if phase.policy is None:

@@ -182,8 +182,7 @@ def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
             hosted,
             ServerOptions(host=job.address, port=0, api_key=job.api_key),
             ready=lambda port: send_message(
-                connection,
-                ServerReady(port=port, metadata=hosted.metadata, compiled=next(iter(found), None)),
+                connection, ServerReady(port=port, metadata=hosted.metadata, compiled=next(iter(found), None))
             ),
             on_compiled=found.append,
             ends=lambda: _wait_for_parent(connection),

@@ -26,12 +26,7 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.testing.inference_rates import inference_rates
-from vla_eval.testing.process_memory import (
-    peak_device_bytes,
-    peak_rss_bytes,
-    reset_device_peak,
-    reset_peak,
-)
+from vla_eval.testing.process_memory import peak_device_bytes, peak_rss_bytes, reset_device_peak, reset_peak
 from vla_eval.testing.random_checkpoint import PART, TASK, built_tiny, stand_in_config, write_checkpoint
 from vla_eval.testing.rehearsed import Estimated, Rehearsed, limit_bytes
 from vla_eval.training.cost.estimate import describe_model, unfilled_model, with_adapters

@@ -97,9 +97,5 @@ KINDS = (
         _of_dataset,
         ("mikasa-vla dataset check {folder}", "mikasa-vla finetune --policy RECIPE --dataset {folder}"),
     ),
-    _Kind(
-        "checkpoint",
-        _of_checkpoint,
-        ("mikasa-vla checkpoint verify {folder}", EVALUATE),
-    ),
+    _Kind("checkpoint", _of_checkpoint, ("mikasa-vla checkpoint verify {folder}", EVALUATE)),
 )

@@ -52,64 +52,56 @@ class JsonLines:
             self.descriptor = None
 
 
-class _Count:
+class _Lines:
     """How far one run, or one phase of a recording, has come."""
 
     def __init__(self, lines: JsonLines, run: str, phase: str | None) -> None:
         self._lines = lines
-        self._begun = self._written = lines.clock()
+        self._start(run, phase)
+
+    def _start(self, run: str, phase: str | None) -> None:
+        self._begun = self._written = self._lines.clock()
         self._n_before = 0
         self._is_ended = False
-        self.state: dict[str, Any] = {"run": run, "phase": phase}  # Any: plain data
+        self._state: dict[str, Any] = {"run": run, "phase": phase}  # Any: plain data
 
-    def begin(self, *, n_done: int, n_total: int, **more: Any) -> None:
+    def _begin(self, *, n_done: int, n_total: int, **more: Any) -> None:
         """Write the first line; `more` are fields that only some kinds of runs know."""
         self._n_before = n_done
-        self.state |= {"episodes_done": n_done, "episodes_total": n_total}
-        self.state |= {"steps_done": None, "steps_total": None, "successes": None, "errors": None, **more}
+        self._state |= {"episodes_done": n_done, "episodes_total": n_total}
+        self._state |= {"steps_done": None, "steps_total": None, "successes": None, "errors": None, **more}
         self._write("begin")
 
-    def tick(self) -> None:
-        if "episodes_total" in self.state and self._lines.clock() - self._written >= EVERY_SECONDS:
+    def on_tick(self) -> None:
+        """Write a line if it is time."""
+        if "episodes_total" in self._state and self._lines.clock() - self._written >= EVERY_SECONDS:
             self._write("progress")
 
-    def note(self, event: str, fields: dict[str, Any]) -> None:
-        self._lines.write(event, {"run": self.state["run"], "phase": self.state["phase"], **fields})
-
-    def end(self, *, stopped: bool) -> None:
-        if "episodes_total" in self.state and not self._is_ended:
+    def close(self, *, stopped: bool) -> None:
+        """Write the last line."""
+        if "episodes_total" in self._state and not self._is_ended:
             self._is_ended = True
-            self.state["stopped"] = stopped
+            self._state["stopped"] = stopped
             self._write("end")
+
+    def _note(self, event: str, fields: dict[str, Any]) -> None:
+        self._lines.write(event, {"run": self._state["run"], "phase": self._state["phase"], **fields})
 
     def _write(self, event: str) -> None:
         self._written = self._lines.clock()
         elapsed = self._written - self._begun
-        n_here = self.state["episodes_done"] - self._n_before
-        n_left = self.state["episodes_total"] - self.state["episodes_done"]
+        n_here = self._state["episodes_done"] - self._n_before
+        n_left = self._state["episodes_total"] - self._state["episodes_done"]
         remaining = 0.0 if not n_left else round(elapsed / n_here * n_left, 1) if n_here else None
         times = {"elapsed_seconds": round(elapsed, 1), "remaining_seconds": remaining}
-        self._lines.write(event, {**self.state, **times})
-
-
-class _Lines:
-    _count: _Count
-
-    def on_tick(self) -> None:
-        """Write a line if it is time."""
-        self._count.tick()
-
-    def close(self, *, stopped: bool) -> None:
-        """Write the last line."""
-        self._count.end(stopped=stopped)
+        self._lines.write(event, {**self._state, **times})
 
 
 class EvaluationLines(_Lines):
     """The lines of an evaluation; its methods are those of `EvaluationObserver`."""
 
     def __init__(self, lines: JsonLines, *, out: Path) -> None:
-        self._count = _Count(lines, str(out), None)
-        self._lines = lines
+        super().__init__(lines, str(out), None)
         self._folder = out
         self._open_steps: dict[EpisodeKey, int] = {}  # episode without a result -> its horizon
 
@@ -121,7 +113,7 @@ class EvaluationLines(_Lines):
         finished = {record.key: record.n_steps or 0 for record in records if record.error is None}
         horizons = {job.key: job.group.offered.horizon_steps for job in plan.jobs}
         self._open_steps = {key: steps for key, steps in horizons.items() if key not in finished}
-        self._count.begin(
+        self._begin(
             n_done=n_finished,
             n_total=len(plan.jobs),
             steps_done=sum(finished.values()),
@@ -139,7 +131,7 @@ class EvaluationLines(_Lines):
         """Count the record; write a line about an error."""
         if self._lines.descriptor is None:
             return
-        state = self._count.state
+        state = self._state
         state["episodes_done"] += 1
         if record.error is None:
             steps = record.n_steps or 0
@@ -150,13 +142,13 @@ class EvaluationLines(_Lines):
         else:
             state["errors"] += 1
             error = {name: getattr(record.error, name) for name in ("kind", "stage", "message")}
-            self._count.note("error", {"episode": record.key._asdict(), **error})
+            self._note("error", {"episode": record.key._asdict(), **error})
 
     def on_load(self, load: Load) -> None:
         """Take what the workers are doing into the next line."""
         if self._lines.descriptor is None:
             return
-        state = self._count.state
+        state = self._state
         n_open = state["episodes_total"] - state["episodes_done"]
         state["steps_running"] = load.n_counted
         state["queue"] = max(0, n_open - load.n_running)
@@ -168,19 +160,18 @@ class PhaseLines(_Lines):
     """The lines of a recording or a replay, phase by phase."""
 
     def __init__(self, lines: JsonLines) -> None:
-        self._lines = lines
-        self._count = _Count(lines, "", None)
+        super().__init__(lines, "", None)
 
     def on_phase(self, task: str, phase: str, *, n_done: int, n_total: int) -> None:
         """End the last phase and begin this one."""
-        self._count.end(stopped=False)
-        self._count = _Count(self._lines, task, phase)
-        self._count.begin(n_done=n_done, n_total=n_total)
+        self.close(stopped=False)
+        self._start(task, phase)
+        self._begin(n_done=n_done, n_total=n_total)
 
     def on_progress(self, *, n_done: int) -> None:
         """Count."""
-        self._count.state["episodes_done"] = n_done
+        self._state["episodes_done"] = n_done
 
     def on_mismatch(self, sentence: str) -> None:
         """Write a line about it."""
-        self._count.note("mismatch", {"message": sentence})
+        self._note("mismatch", {"message": sentence})

@@ -90,10 +90,7 @@ def evaluate_with_progress(
     progress = Progress(stop, out=resolved.out, capture=capture, json_progress=json_progress)
     try:
         return evaluate(
-            resolved,
-            command=command,
-            allow_environment_change=allow_environment_change,
-            observer=progress,
+            resolved, command=command, allow_environment_change=allow_environment_change, observer=progress
         )
     finally:
         progress.close()

@@ -67,7 +67,7 @@ class AttemptJob(_TaskJob):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ShardJob(_TaskJob):
-    """Render and encode some attempts; the answer is a `ShardWritten`."""
+    """Render and encode some attempts; the answer is where they are."""
 
     path: Path
     first_index: int
@@ -106,20 +106,6 @@ class Origin:
     recipe_files: Mapping[str, str]
     environment: Mapping[str, JsonValue]
     device: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ShardWritten:
-    """A shard is on the disk."""
-
-    n_episodes: int
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetWritten:
-    """A dataset is on the disk, complete."""
-
-    facts: DatasetFacts
 
 
 def shard_jobs(plan: TaskPlan, kept: Sequence[Attempt], place: Callable[[int], Path]) -> tuple[ShardJob, ...]:
@@ -167,4 +153,4 @@ def join_job(
 
 
 RecordingJob = AttemptJob | ShardJob | JoinJob
-RecordingAnswer = Attempt | ShardWritten | DatasetWritten
+RecordingAnswer = Attempt | Path | DatasetFacts

@@ -156,6 +156,6 @@ def _join(task: MergedTask, run_file: RunFile, draft: Path) -> DatasetFacts:
     job = join_job(
         task.plan, draft / name, shards=jobs, failed=task.selection.failed, origin=origin_of(run_file)
     )
-    facts = join_dataset(job).facts
+    facts = join_dataset(job)
     remove_shards(draft, name)
     return facts

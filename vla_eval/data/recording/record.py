@@ -19,12 +19,10 @@ from vla_eval.data.manifest import RECORDING_FILE, FailedSeed, read_failed, read
 from vla_eval.data.recording.demonstrations import Attempt
 from vla_eval.data.recording.folder import RecordingFolder, remove_shards
 from vla_eval.data.recording.jobs import (
-    DatasetWritten,
     JoinJob,
     RecordingAnswer,
     RecordingJob,
     ShardJob,
-    ShardWritten,
     TaskPlan,
     join_job,
     shard_jobs,
@@ -178,7 +176,7 @@ def record(
     with RecordingFolder.open(out, description, allow_environment_change=allow_environment_change) as folder:
         spec = WorkerSpec(
             runner=RunnerClass(target=f"{WORKER_MODULE}:RecordingRunner"),
-            answers=(Attempt, ShardWritten, DatasetWritten),
+            answers=(Attempt, Path, DatasetFacts),
             timeouts=recipe.timeouts,
             logs=folder.logs(),
             preload=preload,

@@ -4,10 +4,12 @@ import dataclasses
 import errno
 import shutil
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.core import FloatArray, Policy, SimEnv
 from vla_eval.data.dataset_folder import digest_files
+from vla_eval.data.facts import DatasetFacts
 from vla_eval.data.manifest import (
     FAILED_FILE,
     MANIFEST_FILE,
@@ -27,12 +29,10 @@ from vla_eval.data.recording.demonstrations import (
 )
 from vla_eval.data.recording.jobs import (
     AttemptJob,
-    DatasetWritten,
     JoinJob,
     RecordingAnswer,
     RecordingJob,
     ShardJob,
-    ShardWritten,
     TaskPlan,
 )
 from vla_eval.data.recording.shard_writer import Format, ShardWriter, join_shards
@@ -84,7 +84,7 @@ class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
         acting: SimEnv = NoisyEnv(env, noise) if noise > 0 else env
         return attempt(acting, self._expert, start, plan.group.rollout, heartbeat=self._heartbeat)
 
-    def _write_shard(self, job: ShardJob) -> ShardWritten:
+    def _write_shard(self, job: ShardJob) -> Path:
         plan = job.plan
         env = self._make_env(dataclasses.replace(plan.group.env, cameras=tuple(CAMERA_KEYS)))
         form = Format(
@@ -101,10 +101,10 @@ class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
                 self._heartbeat("setup")  # whose limit is long: encoding
                 episode = recorded_episode(plan, one, log, index=index)
                 writer.add_episode(episode, frames_of(plan.recipe, episode, log))
-        return ShardWritten(n_episodes=len(job.attempts))
+        return job.path
 
 
-def join_dataset(job: JoinJob) -> DatasetWritten:
+def join_dataset(job: JoinJob) -> DatasetFacts:
     """Put the shards of a task together; the dataset appears whole."""
     home = job.shards[0].parent / job.path.name
     remove_drafts(home)
@@ -121,7 +121,7 @@ def join_dataset(job: JoinJob) -> DatasetWritten:
     )
     write_entry(draft / RECORDING_FILE, facts)
     publish(draft, job.path)
-    return DatasetWritten(facts=facts)
+    return facts
 
 
 def recorded_episode(plan: TaskPlan, one: Attempt, log: EpisodeLog, *, index: int) -> RecordedEpisode:

@@ -153,11 +153,7 @@ def _chosen(
 
 
 def _jobs(
-    dataset: Path,
-    facts: DatasetFacts,
-    episodes: Sequence[RecordedEpisode],
-    pixels: bool,
-    same_machine: bool,
+    dataset: Path, facts: DatasetFacts, episodes: Sequence[RecordedEpisode], pixels: bool, same_machine: bool
 ) -> list[ReplayJob]:
     recipe = recipe_of(facts)
     check_task_versions(dataset, episodes)

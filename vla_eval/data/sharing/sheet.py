@@ -23,11 +23,10 @@ def draw_sheet(dataset: OpenDataset) -> bytes:
     videos = zip(*(decode_camera(frames, camera) for camera in cameras), strict=True)
     rows = []
     labels: Sequence[str] = ()
-    manifest = dataset.manifest
+    episodes = dataset.manifest
     for number, (base_TCHW, wrist_TCHW) in zip(chosen, videos, strict=True):
         # As many moments for every episode of a dataset.
         last = dataset.lengths[number] - 1
-        episodes = dataset.manifest
         if episodes and episodes[0].cue_steps:
             episode = episodes[number]
             choice = episode.cue_steps + episode.delay_steps
@@ -42,7 +41,7 @@ def draw_sheet(dataset: OpenDataset) -> bytes:
         pictures = [*base_TCHW[steps], wrist_TCHW[-1]]
         rows.append(
             SheetRow(
-                name=f"episode {number}" + (f"\nseed {manifest[number].seed}" if manifest else ""),
+                name=f"episode {number}" + (f"\nseed {episodes[number].seed}" if episodes else ""),
                 frames=tuple(np.ascontiguousarray(picture.transpose(1, 2, 0)) for picture in pictures),
             )
         )
