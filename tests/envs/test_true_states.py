@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from tests.envs.hiding_env import HALF_M, HIDDEN_M, HIDDEN_STEPS, PLACED_M, PLACED_STEP, HidingEnv
-from vla_eval.envs.true_states import with_true_states
+from vla_eval.envs.true_states import TrueStates
 
 
 @pytest.fixture(scope="module")
 def env() -> Any:
-    made = with_true_states(HidingEnv)()
+    made = type("ShowingEnv", (TrueStates, HidingEnv), {})()
     yield made
     made.close()
 

@@ -25,7 +25,7 @@ from vla_eval.envs.official_mug import provide_mug
 from vla_eval.envs.official_settings import MUG, check_official
 from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates, to_vector
 from vla_eval.envs.scenes import build, describe, take_human_image, take_images
-from vla_eval.envs.true_states import with_true_states
+from vla_eval.envs.true_states import TrueStates
 from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, check_names
 from vla_eval.oracles.arm_model import gripper_command
 from vla_eval.task_state import Phase, PrivilegedState, TaskStatus
@@ -152,7 +152,7 @@ def _adapted(cls: Any) -> Any:
         env._get_obs_extra(info)  # some tasks compute there what their rewards read
         return {}
 
-    return type(cls.__name__, (with_true_states(cls),), {"__module__": cls.__module__, "get_obs": get_obs})
+    return type(cls.__name__, (TrueStates, cls), {"__module__": cls.__module__, "get_obs": get_obs})
 
 
 def _build(cls: Any, settings: EnvSettings) -> Any:

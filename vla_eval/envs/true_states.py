@@ -17,7 +17,7 @@ PARKED_ABOVE_M = 500.0  # the official tasks park at 1000 m; nothing on a table 
 
 
 class TrueStates:
-    """Mixed in before the class of an environment with one scene on the CPU, see `with_true_states`."""
+    """Comes before the class of an environment with one scene on the CPU: its physics see no shown poses."""
 
     _evaluated: Info | None = None
     _true_poses: Mapping[int, Any] = {}  # of what is shown elsewhere: id of the body -> sapien.Pose
@@ -69,11 +69,6 @@ class TrueStates:
                 body.linear_velocity = body.angular_velocity = np.zeros(3)
         self._parked_poses = parked
         return super()._step_action(action)  # type: ignore[misc]
-
-
-def with_true_states(cls: Any) -> Any:
-    """Return the environment's class with its physics separated from what `evaluate` shows."""
-    return type(cls.__name__, (TrueStates, cls), {"__module__": cls.__module__})
 
 
 def _movable(env: Any) -> dict[int, Any]:

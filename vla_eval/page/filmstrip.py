@@ -38,7 +38,12 @@ def write_filmstrips(runs: Sequence[StoredRun], folder: Path) -> Filmstrips:
             continue
         columns = _columns(group.results)
         files.append(folder / f"{re.sub(r'[^A-Za-z0-9._=-]+', '_', _name(key))}.png")
-        _write(files[-1], contact_sheet(columns, rows, title=(_name(key), LEGEND)))
+        sheet = contact_sheet(columns, rows, title=(_name(key), LEGEND))
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            files[-1].write_bytes(sheet)
+        except OSError as exc:
+            raise ViewingError(f"{files[-1]}: cannot be written ({exc}). Name another --filmstrip.") from exc
     if not files:
         shown = some_of(str(run.path) for run in runs)
         raise ViewingError(
@@ -87,11 +92,3 @@ def _row(record: EpisodeRecord, path: Path) -> SheetRow:
 def _name(key: RowKey) -> str:
     variant = f" {key.variant}" if key.variant else ""
     return f"{key.task} {key.policy} K{key.n_action_steps}{variant}"
-
-
-def _write(path: Path, png: bytes) -> None:
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(png)
-    except OSError as exc:
-        raise ViewingError(f"{path}: cannot be written ({exc}). Name another --filmstrip.") from exc

@@ -1,7 +1,7 @@
 """Escape text for LaTeX and write its tables. Knows nothing of results."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 from vla_eval.plain_text import printable
 
@@ -57,11 +57,6 @@ def fitted(lines: Sequence[str]) -> list[str]:
     r"""Return a table that is scaled down to `\linewidth` where it is wider; needs booktabs and graphicx."""
     scale = "\\noindent\\resizebox{\\ifdim\\width>\\linewidth\\linewidth\\else\\width\\fi}{!}{%"
     return [scale, *lines, "}"]
-
-
-def footnotes(notes: Iterable[str]) -> list[str]:
-    """Return the lines below a table, a paragraph for each note."""
-    return [f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in notes]
 
 
 def latex_row(cells: Sequence[str]) -> str:

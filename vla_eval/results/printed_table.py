@@ -8,7 +8,7 @@ from typing import Any, Self  # Any: of whatever rows
 
 from vla_eval.results.cells import csv_cell, html_table, html_text, markdown_cell, markdown_text
 from vla_eval.results.formats import ReadableFormat
-from vla_eval.results.latex import NEEDS, fitted, footnotes, latex_table, latex_text
+from vla_eval.results.latex import NEEDS, fitted, latex_table, latex_text
 
 UNDEFINED = "—"
 
@@ -148,7 +148,7 @@ def _latex(table: PrintedTable) -> list[str]:
             lines += ["", f"\\par\\medskip\\textbf{{{latex_text(table.title)}}}\\par\\smallskip"]
         by_task = table.titles[:1] == ["task"]
         lines += fitted(latex_table(table.titles, table.rows, table.is_number, ruled_by_first=by_task))
-    return [*lines, *footnotes(table.notes)]
+    return [*lines, *(f"\\par\\smallskip{{\\footnotesize {latex_text(note)}\\par}}" for note in table.notes)]
 
 
 def _html(table: PrintedTable) -> list[str]:

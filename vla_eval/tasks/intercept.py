@@ -1,6 +1,5 @@
 """Intercept: a ball rolls by; deflect it so that it passes over the target disc."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from vla_eval.tasks.objects.bodies import (
     spin_of,
     velocity_of,
 )
+from vla_eval.tasks.objects.items import Z_UP_WXYZ
 from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
 
@@ -30,7 +30,6 @@ GOAL_Y_M = (-0.2, 0.2)
 GOAL_Z_M = 0.001
 HIT_OFFSET_M = 0.07  # distance of the reward's hit point behind the ball, seen from the goal
 HIT_REACHED_M = 0.04
-UPWARDS_WXYZ = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # ManiSkill's disc faces x; turn it up
 
 
 class InterceptEnv(RollingBallEnv):
@@ -75,7 +74,7 @@ class InterceptEnv(RollingBallEnv):
             name="goal_region",
             add_collision=False,
             body_type="kinematic",
-            initial_pose=sapien.Pose(p=[0, 0, GOAL_Z_M], q=list(UPWARDS_WXYZ)),
+            initial_pose=sapien.Pose(p=[0, 0, GOAL_Z_M], q=list(Z_UP_WXYZ)),
         )
         self._goal_position: FloatArray = np.zeros((self.num_envs, 3), dtype=np.float32)
         self._hit_point_reached: Flags = np.zeros(self.num_envs, dtype=np.bool_)
@@ -86,7 +85,7 @@ class InterceptEnv(RollingBallEnv):
     def _on_episode_start(self, mask: Flags) -> None:
         self._hit_point_reached[mask] = False
         super()._on_episode_start(mask)
-        self.move(self.goal, mask, poses(self._goal_position, UPWARDS_WXYZ))
+        self.move(self.goal, mask, poses(self._goal_position, Z_UP_WXYZ))
 
     def _ball_to_goal_m(self) -> FloatArray:
         return position_of(self.goal) - self.ball_position_m()

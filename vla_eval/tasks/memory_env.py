@@ -1,11 +1,7 @@
 """The base of all memory tasks: robot, cameras, table, phases, placing and parking of objects.
 
-Differences from the official code that concern every task (reasons in `docs/tasks.md`):
-
-- Objects are hidden and revealed in one hook at phase edges, with velocities zeroed, on any backend;
-  `evaluate()` only reads. Hidden objects are parked on the floor, `PARK_X_M` away, beyond the far
-  plane of every camera: never seen, never touched, at rest.
-- All randomness comes from `streams.generator(seed, purpose)` of the single episode.
+`docs/tasks.md` says what differs from the official code in every task, and why. Hidden objects are parked on
+the floor, at rest, beyond the far plane of every camera.
 
 What a task knows of its episodes is numpy, (B, …) for B parallel environments: for one arm, torch takes most
 of a control step. Tensors are made only for those who step ManiSkill's environment itself (`get_info`).

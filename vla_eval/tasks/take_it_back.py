@@ -8,7 +8,6 @@ from mani_skill.utils.building import actors
 
 from vla_eval.core import FloatArray
 from vla_eval.seeding import Stream
-from vla_eval.tasks.intercept import UPWARDS_WXYZ
 from vla_eval.tasks.memory_env import nearness, poses
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import (
@@ -23,6 +22,7 @@ from vla_eval.tasks.objects.bodies import (
     resting_body,
     velocity_of,
 )
+from vla_eval.tasks.objects.items import Z_UP_WXYZ
 from vla_eval.tasks.objects.layout import GOAL_X_M, GOAL_Y_M, START_BAND_WIDTH_M, START_BANDS_Y_M, START_X_M
 from vla_eval.tasks.objects.limits import BodySize, GoalRadius, Positive
 from vla_eval.tasks.tensors_out import Info
@@ -112,7 +112,7 @@ class TakeItBackEnv(WithoutCueEnv):
 
     def _parked_disc(self, name: str) -> sapien.Pose:
         pose = self.parking_pose(name, half_height_m=DISC_Z_M)
-        return sapien.Pose(p=pose.p, q=list(UPWARDS_WXYZ))
+        return sapien.Pose(p=pose.p, q=list(Z_UP_WXYZ))
 
     def _sample_episode(self, env: int) -> None:
         layout = self.episode_generator(env, Stream.LAYOUT)
@@ -135,7 +135,7 @@ class TakeItBackEnv(WithoutCueEnv):
         """Show the violet disc where `mask` and `violet` hold, the red one where only `mask` does."""
         if not anywhere(mask):
             return
-        at_goal = poses(self._goal_position, UPWARDS_WXYZ)
+        at_goal = poses(self._goal_position, Z_UP_WXYZ)
         for disc, shown in ((self.red_disc, mask & ~violet), (self.violet_disc, mask & violet)):
             self.move(disc, shown, at_goal)
             self.move(disc, mask & ~shown, self._parked_disc(disc.name))

@@ -20,7 +20,7 @@ from vla_eval.tasks.objects.limits import CubeHalfSize
 
 S = 0.02  # m, the official scale: half the edge of a cube
 BAR = 0.375 * S
-Z_UP_WXYZ = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # SAPIEN's cylinders lie along x; turn them up
+Z_UP_WXYZ = (math.sqrt(0.5), 0.0, math.sqrt(0.5), 0.0)  # cylinders and discs face x; turn them up
 
 
 class NamedColor(NamedTuple):
