@@ -61,7 +61,7 @@ class ItemChoiceEnv(ChoiceEnv):
         self._hides_items = self.is_swapped() and not self.gpu_sim_enabled
         uses_decoys = self._hides_items or self.distract_steps > 0
         self.decoys = [
-            build_decoy(self.scene, item, initial_pose=self._decoy_parking_pose(item))
+            build_decoy(self.scene, item, initial_pose=self._parking_pose(item, "_decoy"))
             for item in (self.items if uses_decoys else ())
         ]
         self._distractor: Indices = np.zeros(self.num_envs, dtype=np.int64)
@@ -70,11 +70,8 @@ class ItemChoiceEnv(ChoiceEnv):
         """Return whether another cue than the drawn one is shown."""
         return self.swap_cue > 0
 
-    def _decoy_parking_pose(self, item: Item) -> sapien.Pose:
-        return self.parking_pose(f"{item.name}_decoy", half_height_m=item.shape.rest_height_m)
-
-    def _parking_pose(self, item: Item) -> sapien.Pose:
-        return self.parking_pose(item.name, half_height_m=item.shape.rest_height_m)
+    def _parking_pose(self, item: Item, suffix: str = "") -> sapien.Pose:
+        return self.parking_pose(f"{item.name}{suffix}", half_height_m=item.shape.rest_height_m)
 
     def _sample_slots(self, env: int) -> None:
         places = self._places_m(self.episode_generator(env, Stream.LAYOUT))
@@ -100,7 +97,7 @@ class ItemChoiceEnv(ChoiceEnv):
 
     def _park_decoys(self, mask: Flags) -> None:
         for item, decoy in zip(self.items, self.decoys, strict=False):  # of no decoys or of all
-            self.move(decoy, mask, self._decoy_parking_pose(item))
+            self.move(decoy, mask, self._parking_pose(item, "_decoy"))
 
     def _sample_distractor(self, env: int, excluded: Collection[int]) -> None:
         """Draw the item that distracts, after the cue: none that is right, or that the drawn cue shows."""

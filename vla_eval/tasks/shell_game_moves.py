@@ -48,6 +48,10 @@ class ShellGameMoveEnv(ShellGameEnv):
 
     MODE: int
     """Number of the mode in random streams. Part of every result: never renumber, only add."""
+    goal_offset_m: tuple[float, float, float]
+    """The goal relative to the ball's centre; world frame."""
+    chosen_m: float
+    """The distance by which a mug must have been moved to count as chosen."""
     SLOWING_WEIGHT = 0.2
     RESTING_WEIGHT = 0.2
 
@@ -55,15 +59,11 @@ class ShellGameMoveEnv(ShellGameEnv):
         """Return the shell game's number and the mode's: a seed gives different places in each mode."""
         return (self.FAMILY, self.MODE)
 
-    def _goal_offset_m(self) -> tuple[float, float, float]:
-        """Return the goal relative to the ball's centre; world frame."""
-        raise NotImplementedError
-
     def goal_positions_m(self) -> FloatArray:
         """Return (B, N, 3): the goal of each mug if the ball were under it; world frame."""
         goals = self._slots.copy()
         goals[:, :, 2] = BALL_RADIUS_M
-        return goals + np.array(self._goal_offset_m(), dtype=np.float32)
+        return goals + np.array(self.goal_offset_m, dtype=np.float32)
 
     def _target_to_goal_m(self) -> FloatArray:
         return self._of_target(self.goal_positions_m()) - position_of_one(self.candidates, self._target)
@@ -71,10 +71,6 @@ class ShellGameMoveEnv(ShellGameEnv):
     def is_placed(self, reach_m: FloatArray) -> Flags:
         """Return (B,) bool: the right mug is within the threshold of its goal."""
         return length(self._target_to_goal_m()) <= self.goal_threshold_m
-
-    def _chosen_m(self) -> float:
-        """Return the distance by which a mug must have been moved to count as chosen."""
-        return CHOSEN_M
 
     def _update_latches(self, step: Steps) -> None:
         begun = step > self._response_step
@@ -84,7 +80,7 @@ class ShellGameMoveEnv(ShellGameEnv):
         # Largest movement first: it was touched first if two pass the limit in the same step.
         order = (-moved_m).argsort(axis=1, kind="stable")
         for index in order.T:
-            self._latch_touch(begun & (moved_m[self._rows, index] >= self._chosen_m()), index)
+            self._latch_touch(begun & (moved_m[self._rows, index] >= self.chosen_m), index)
 
     def extra_info(self) -> Info:
         """Return the way of the right mug to its goal."""
@@ -129,14 +125,9 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     ) -> None:
         limits.check(Positive, push_distance_m=push_distance_m)
         limits.check_together(goal_threshold_m=goal_threshold_m, push_distance_m=push_distance_m)
-        self.push_distance_m = push_distance_m
+        self.goal_offset_m = (push_distance_m, 0.0, GOAL_ABOVE_BALL_M)
+        self.chosen_m = min(CHOSEN_M, push_distance_m - goal_threshold_m)
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
-
-    def _goal_offset_m(self) -> tuple[float, float, float]:
-        return (self.push_distance_m, 0.0, GOAL_ABOVE_BALL_M)
-
-    def _chosen_m(self) -> float:
-        return min(CHOSEN_M, self.push_distance_m - self.goal_threshold_m)
 
     def reward_terms(self, info: Info) -> Info:
         """Reach the right mug and push it, once the mugs stand there."""
@@ -179,6 +170,8 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         limits.check(LiftHeight, lift_height_m=lift_height_m)
         limits.check_together(goal_threshold_m=goal_threshold_m, lift_height_m=lift_height_m)
         self.lift_height_m = lift_height_m
+        self.goal_offset_m = (0.0, 0.0, lift_height_m + GOAL_ABOVE_BALL_M)
+        self.chosen_m = min(CHOSEN_M, lift_height_m - (goal_threshold_m or 0.0))
         self.goal_is_a_point = goal_threshold_m is not None
         self.official_mug_yaws = official_mug_yaws
         super().__init__(
@@ -187,9 +180,6 @@ class ShellGamePickEnv(ShellGameMoveEnv):
             **kwargs,
         )
 
-    def _goal_offset_m(self) -> tuple[float, float, float]:
-        return (0.0, 0.0, self.lift_height_m + GOAL_ABOVE_BALL_M)
-
     def is_placed(self, reach_m: FloatArray) -> Flags:
         """Return (B,) bool: the right mug has been lifted high enough."""
         if self.goal_is_a_point:
@@ -197,10 +187,6 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         risen_m = position_of_one(self.candidates, self._target) - self._of_target(self._slots)
         risen: Flags = self.response_begun() & (risen_m[:, 2] >= self.lift_height_m)
         return risen
-
-    def _chosen_m(self) -> float:
-        needed_m = self.lift_height_m - (self.goal_threshold_m if self.goal_is_a_point else 0.0)
-        return min(CHOSEN_M, needed_m)
 
     def _mug_orientation_wxyz(self) -> FloatArray | Wxyz:
         quaternions = np.array([_upside_down_wxyz(turn) for turn in OFFICIAL_TURNS], dtype=np.float32)
