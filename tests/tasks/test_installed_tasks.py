@@ -43,7 +43,6 @@ ROW = TaskSpec(
     candidates="items",
     candidate_counts={"n_items": 4},
     chance_success=1 / 4,
-    max_reward=3.0,
 )
 ROWS = [ROW]
 TAKEN = [ROW, ROW]

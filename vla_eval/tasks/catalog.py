@@ -46,7 +46,6 @@ def _remember(family: str, number: str, kwargs: dict[str, int], what: str) -> Ta
         candidates="items",
         candidate_counts=kwargs,
         chance_success=1 / math.prod(kwargs.values()),
-        max_reward=3.0,
         other_arms=(FETCH_UID,),
     )
 
@@ -73,9 +72,7 @@ _REMEMBER = (
 )
 
 
-def _shell_game(
-    mode: str, *, asks: str, success: str, oracle: str, max_reward: float, turns_wrist: bool = False
-) -> TaskSpec:
+def _shell_game(mode: str, *, asks: str, success: str, oracle: str, turns_wrist: bool = False) -> TaskSpec:
     module = "shell_game" if mode == "Touch" else "shell_game_moves"
     return TaskSpec(
         id=f"ShellGame{mode}-v0",
@@ -93,7 +90,6 @@ def _shell_game(
         candidate_counts={"n_mugs": N_MUGS},
         cue_marks_place=True,
         chance_success=1 / N_MUGS,
-        max_reward=max_reward,
     )
 
 
@@ -103,14 +99,12 @@ _SHELL_GAME = (
         asks="reach the mug that hides the ball.",
         success="The tool centre point is within 8 cm of the right mug and the arm is at rest.",
         oracle="vla_eval.oracles.hover:MUGS",
-        max_reward=3.0,
     ),
     _shell_game(
         "Push",
         asks="push the mug that hides the ball forwards.",
         success="The right mug is within 8 cm of a point 10 cm ahead of the ball and the arm is at rest.",
         oracle="vla_eval.oracles.push:MUGS",
-        max_reward=4.0,
     ),
     _shell_game(
         "Pick",
@@ -118,7 +112,6 @@ _SHELL_GAME = (
         success="The right mug's centre has risen by 10 cm and the arm is at rest.",
         oracle="vla_eval.oracles.pick:MUGS",
         turns_wrist=True,
-        max_reward=75.0,
     ),
 )
 

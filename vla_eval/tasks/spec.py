@@ -68,7 +68,6 @@ class TaskSpec:
     # success rate of a perfect arm that ignores the cue; None if it has to be measured (there is no
     # choice among candidates), or depends on the arguments (families)
     chance_success: float | None
-    max_reward: float  # the dense reward at success, by which `normalized_dense` divides
     idle_success: float = 0.0  # measured success rate of doing nothing; 0 for all tasks but a few
     cue_marks_place: bool = False  # the cue is shown where the right candidate will be
     shows_one_by_one: bool = False  # the cue is `n_shown` items one after another, each for `cue_steps`

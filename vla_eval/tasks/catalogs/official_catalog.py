@@ -94,7 +94,6 @@ def _row(line: dict[str, str]) -> TaskSpec:
         description=line["instruction"],
         success=_AS_PACKAGE,
         candidates=None,
-        max_reward=1.0,
         suite="mikasa_vla_90",
         phase_source=cast(PhaseSource, line["phases"]),
         waits_for_choice=line["waits"] == "yes",

@@ -34,7 +34,6 @@ def _several(family: str, memory: MemoryType, one_by_one: bool, in_order: bool, 
         candidate_counts={"n_items": N_CUBES},
         several_right=True,
         chance_success=chance_of_several(N_CUBES, n_shown, in_order=in_order),
-        max_reward=100.0,
         shows_one_by_one=one_by_one,
     )
 

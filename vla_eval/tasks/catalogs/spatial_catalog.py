@@ -38,7 +38,6 @@ def _intercept(mode: str) -> TaskSpec:
         seen_in_one_frame="ball",
         idle_success=IDLE_SUCCESS.get(mode, 0.0),
         oracle_sees="positions and velocity of ball and target, once the base camera could see the ball",
-        max_reward=30.0,
     )
 
 
@@ -53,7 +52,6 @@ def _intercept_grab(mode: str) -> TaskSpec:
         oracle=f"vla_eval.oracles.catch:{mode.upper()}",
         seen_in_one_frame="ball",
         oracle_sees="position and velocity of the ball, once the base camera could see it",
-        max_reward=300.0,
     )
 
 
@@ -74,7 +72,6 @@ def _rotate(mode: str, *, strict: bool) -> TaskSpec:
         oracle="vla_eval.oracles.turn:PEG_SIGNED" if signed else "vla_eval.oracles.turn:PEG",
         turns_wrist=True,
         oracle_sees="place and yaw of the peg, now and at the start, and the angle asked for",
-        max_reward=100.0 if strict else 25.0,
     )
 
 
@@ -90,7 +87,6 @@ _TAKE_IT_BACK = _spatial(
     oracle="vla_eval.oracles.carry:CUBE",
     seen_in_one_frame="cube",
     oracle_sees="places of cube and disc, and the cube's first place, which it sees at the start",
-    max_reward=30.0,
 )
 
 SPATIAL_TASKS = (
