@@ -24,7 +24,7 @@ from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.evaluation.model_table import is_model_table, load_model_table
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.arguments import check_arguments
-from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.catalog import task_spec
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -76,7 +76,7 @@ def is_name(text: str) -> bool:
 
 def check_task(name: str, env: dict[str, Any]) -> None:
     spec = task_spec(name)
-    check_arguments(spec, env, TASKS.values())
+    check_arguments(spec, env)
 
 
 def check_names(args: argparse.Namespace) -> None:

@@ -12,7 +12,7 @@ from vla_eval.errors import MissingDependencyError, unknown_name
 from vla_eval.lock.switch import own_need
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import check_arguments, offered_by, robot_uid
-from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.catalog import task_spec
 
 SIMULATORS = {"maniskill": "vla_eval.envs.maniskill:ManiSkillEnv", "fake": "vla_eval.envs.fake:FakeEnv"}
 OFFICIAL = "vla_eval.envs.official:OfficialEnv"
@@ -60,7 +60,7 @@ def describe_env(settings: EnvSettings) -> EnvSpec:
     if task.is_official:
         check_official(settings, task)
     else:
-        check_arguments(task, settings.kwargs, TASKS.values())
+        check_arguments(task, settings.kwargs)
         robot_uid(settings.kwargs, wrist_mesh=settings.render.wrist_mesh)
     return offered_by(task, settings.kwargs)
 

@@ -23,7 +23,7 @@ from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus, only_one
 from vla_eval.tasks.arguments import check_argument, check_arguments
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
-from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import ACTION, CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.objects.layout import places_from_right
 from vla_eval.tasks.spec import TaskSpec, chance_of_several
@@ -76,7 +76,7 @@ class FakeEnv:
         if task.is_official:
             check_official(settings, task)
         else:
-            check_arguments(task, settings.kwargs, TASKS.values())
+            check_arguments(task, settings.kwargs)
             known = ("horizon_steps", CONTROL_MODE, IMAGE_SIZE, *defaults)
             check_names("argument", settings.kwargs, known, where=task.id)
         arguments = {**defaults, **task.kwargs, **settings.kwargs}

@@ -29,7 +29,7 @@ from vla_eval.specs import EnvSpec
 from vla_eval.tasks.appearance import with_appearance
 from vla_eval.tasks.arguments import ROBOT, check_arguments, horizon_steps, robot_uid
 from vla_eval.tasks.arm.arm_control import drive_together
-from vla_eval.tasks.catalog import TASKS, task_spec
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
 from vla_eval.tasks.memory_env import CueSize, MemoryTableEnv, Place
 from vla_eval.tasks.register import env_class
@@ -44,7 +44,7 @@ class ManiSkillEnv:
 
     def __init__(self, settings: EnvSettings) -> None:
         row = task_spec(settings.task)
-        check_arguments(row, settings.kwargs, TASKS.values())
+        check_arguments(row, settings.kwargs)
         kwargs = {**row.kwargs, **settings.kwargs}
         wanted_steps = kwargs.pop("horizon_steps", None)
         check_names("camera", settings.cameras, CAMERA_NAMES, where=row.id)

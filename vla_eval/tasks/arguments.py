@@ -4,7 +4,7 @@ No simulator is started: the task's row and the source of its class say it all.
 """
 
 import ast
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Annotated, Any, Literal, get_args, get_origin
 
@@ -15,6 +15,7 @@ from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
 from vla_eval.strict.decoding import check_value
 from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS
+from vla_eval.tasks.catalog import TASKS
 from vla_eval.tasks.interface import (
     CONTROL_HZ,
     IMAGE_SIZE,
@@ -44,10 +45,8 @@ ANNOTATIONS: Mapping[str, Any] = {  # Any: type annotations
 """Annotation in the source of a task -> the type; arguments with another one are checked by the class."""
 
 
-def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
+def check_arguments(spec: TaskSpec, given: Mapping[str, object]) -> None:
     """Check all that can be wrong with a task's arguments; a class of another package may refuse more.
-
-    `spec` is a row of the catalogue, or a family; `rows` is the catalogue, for the message.
 
     Raises:
         TaskArgumentError: a required argument of a family is missing; or an argument needs candidates,
@@ -55,7 +54,7 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[
             the choice.
         UnknownNameError: there is no such argument, arm or control mode.
     """
-    _check_open(spec, given, rows)
+    _check_open(spec, given)
     of_choices = [f"env.{name}" for name in CHOICE_ARGUMENTS if name in given]
     if of_choices and spec.candidates is None:
         raise TaskArgumentError(
@@ -75,11 +74,12 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[
     horizon_steps(spec, longest_wait_steps(spec, given), given.get(HORIZON))
 
 
-def _check_open(spec: TaskSpec, given: Mapping[str, object], rows: Iterable[TaskSpec]) -> None:
+def _check_open(spec: TaskSpec, given: Mapping[str, object]) -> None:
     """Raise unless a family is given all that makes a task of it."""
     missing = [name for name in spec.open_arguments if name not in given]
     if not missing:
         return
+    rows = TASKS.values()
     known = [row.id for row in rows if row.id.startswith(spec.id) and row.entry_point == spec.entry_point]
     wanted = " ".join(f"--set env.{name}=…" for name in missing)
     raise TaskArgumentError(
