@@ -16,14 +16,7 @@ from vla_eval.specs import EnvSpec
 from vla_eval.strict.decoding import check_value
 from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS
 from vla_eval.tasks.catalog import TASKS
-from vla_eval.tasks.interface import (
-    CONTROL_HZ,
-    IMAGE_SIZE,
-    StepRange,
-    cameras,
-    states,
-    step_range,
-)
+from vla_eval.tasks.interface import CONTROL_HZ, IMAGE_SIZE, StepRange, cameras, states, step_range
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.limits import LIMITED, check_together, n_swaps
 from vla_eval.tasks.source import class_constant, task_arguments

@@ -350,11 +350,7 @@ class MemoryTableEnv(TensorsOut):
     def read_info(self) -> Info:
         """Return the info of the present step, (B, …) arrays by name; every array in it is a new one."""
         steps = self.step_count()
-        return {
-            "elapsed_steps": steps.copy(),
-            **self.evaluate(),
-            "phase": self.phase_index(steps),
-        }
+        return {"elapsed_steps": steps.copy(), **self.evaluate(), "phase": self.phase_index(steps)}
 
     # ---------------------------------------------------------------- reward
 

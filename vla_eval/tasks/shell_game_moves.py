@@ -175,9 +175,7 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         self.goal_is_a_point = goal_threshold_m is not None
         self.official_mug_yaws = official_mug_yaws
         super().__init__(
-            *args,
-            goal_threshold_m=lift_height_m if goal_threshold_m is None else goal_threshold_m,
-            **kwargs,
+            *args, goal_threshold_m=lift_height_m if goal_threshold_m is None else goal_threshold_m, **kwargs
         )
 
     def is_placed(self, reach_m: FloatArray) -> Flags:

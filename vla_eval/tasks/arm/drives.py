@@ -212,10 +212,7 @@ def _at_base(base: sapien.Pose) -> Callable[[sapien.Pose], tuple[FloatArray, Qua
     w, x, y, z = base.q
     inverse = (w, -x, -y, -z)
     offset = _rotated(inverse, tuple(-base.p))
-    return lambda tip: (
-        offset + _rotated(inverse, tuple(tip.p)),
-        _standard(_product(inverse, tuple(tip.q))),
-    )
+    return lambda tip: (offset + _rotated(inverse, tuple(tip.p)), _standard(_product(inverse, tuple(tip.q))))
 
 
 def _from_euler(angles_rad: FloatArray) -> list[Quaternion]:
