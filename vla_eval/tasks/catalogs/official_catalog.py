@@ -13,7 +13,6 @@ made from https://github.com/CognitiveAISystems/MIKASA-Robo, tag v1.0.0 (16634db
 import csv
 import re
 from collections.abc import Iterable
-from dataclasses import replace
 from importlib.resources import files
 from typing import Any, cast
 
@@ -24,7 +23,11 @@ NAMESPACE_90 = "mikasa_vla/"
 NAMESPACE_ORIGINAL = "mikasa_official/"
 TABLE = "official_90.csv"
 ENTRY_POINT = "vla_eval.envs.official:OfficialEnv"
-_AS_PACKAGE = "as the official package has it"
+_OF_ALL: dict[str, Any] = {
+    **{"version": 1, "entry_point": ENTRY_POINT, "success": "as the official package has it"},
+    **{"oracle": "", "oracle_sees": "there is none", "candidates": None, "chance_success": None},
+}
+"""Fields of all official tasks, without controls."""
 
 
 _ITEMS_SEEN = "poses of all items and which one is right; moves once the choice has appeared"
@@ -82,22 +85,17 @@ def _speeds(task: str) -> dict[str, Any]:
 
 
 def _row(line: dict[str, str]) -> TaskSpec:
-    fields: dict[str, Any] = {"oracle": "", "oracle_sees": "there is none", "chance_success": None}
     return TaskSpec(
         id=f"{NAMESPACE_90}{line['name']}",
-        version=1,
-        entry_point=ENTRY_POINT,
         horizon_steps=int(line["horizon_steps"]),
         memory=cast(MemoryType, line["memory"]),
         instruction_key=f"{NAMESPACE_90}{line['name']}",
         instruction=line["instruction"],
         description=line["instruction"],
-        success=_AS_PACKAGE,
-        candidates=None,
         suite="mikasa_vla_90",
         phase_source=cast(PhaseSource, line["phases"]),
         waits_for_choice=line["waits"] == "yes",
-        **{**fields, **control_fields(line["name"])},
+        **{**_OF_ALL, **control_fields(line["name"])},
     )
 
 
@@ -112,26 +110,15 @@ def original_tasks(rows: Iterable[TaskSpec]) -> dict[str, TaskSpec]:
     none of the official observations.
     """
     found = (
-        replace(
-            row,
+        TaskSpec(
             id=f"{NAMESPACE_ORIGINAL}{row.id}",
-            version=1,
-            entry_point=ENTRY_POINT,
-            kwargs={},
-            success=_AS_PACKAGE,
-            oracle="",
-            oracle_sees="there is none",
-            turns_wrist=False,
-            candidates=None,
-            candidate_counts={},
-            several_right=False,
-            seen_in_one_frame=None,
-            chance_success=None,
-            idle_success=0.0,
-            cue_marks_place=False,
-            shows_one_by_one=False,
+            horizon_steps=row.horizon_steps,
+            memory=row.memory,
+            instruction_key=row.instruction_key,
+            description=row.description,
             suite="mikasa_official",
             phase_source=_original_phases(row),
+            **_OF_ALL,
         )
         for row in rows
         if not row.id.startswith("Rotate")
