@@ -33,7 +33,6 @@ N_MUGS = 3
 def _remember(family: str, number: str, kwargs: dict[str, int], what: str) -> TaskSpec:
     return TaskSpec(
         id=f"{family}{number}-v0",
-        version=1,
         entry_point=f"vla_eval.tasks.remember:{family}Env",
         kwargs=kwargs,
         horizon_steps=60,
@@ -76,7 +75,6 @@ def _shell_game(mode: str, *, asks: str, success: str, oracle: str, turns_wrist:
     module = "shell_game" if mode == "Touch" else "shell_game_moves"
     return TaskSpec(
         id=f"ShellGame{mode}-v0",
-        version=1,
         entry_point=f"vla_eval.tasks.{module}:ShellGame{mode}Env",
         horizon_steps=90,
         memory="object",

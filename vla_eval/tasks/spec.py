@@ -42,7 +42,7 @@ class TaskSpec:
     """One row of the catalogue."""
 
     id: str  # task id without namespace, `RememberColor3-v0`; the gym id is `vla_eval/<id>`
-    version: int  # raised when a change affects a success rate; recorded with each run
+    version: int = 1  # raised when a change affects a success rate; recorded with each run
     entry_point: str  # `module:Class` of the ManiSkill environment
     # arguments that make this row of its family; a user's arguments override them
     kwargs: Mapping[str, Any] = field(default_factory=dict)

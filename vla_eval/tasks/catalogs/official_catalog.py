@@ -24,7 +24,7 @@ NAMESPACE_ORIGINAL = "mikasa_official/"
 TABLE = "official_90.csv"
 ENTRY_POINT = "vla_eval.envs.official:OfficialEnv"
 _OF_ALL: dict[str, Any] = {
-    **{"version": 1, "entry_point": ENTRY_POINT, "success": "as the official package has it"},
+    **{"entry_point": ENTRY_POINT, "success": "as the official package has it"},
     **{"oracle": "", "oracle_sees": "there is none", "candidates": None, "chance_success": None},
 }
 """Fields of all official tasks, without controls."""

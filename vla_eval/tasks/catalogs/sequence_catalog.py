@@ -11,7 +11,6 @@ def _several(family: str, memory: MemoryType, one_by_one: bool, in_order: bool, 
     order = "in the order shown" if in_order else "in any order"
     return TaskSpec(
         id=f"{family}{n_shown}-v0",
-        version=1,
         entry_point=f"vla_eval.tasks.sequences:{family}Env",
         kwargs={"n_shown": n_shown},
         horizon_steps=HORIZON_STEPS,

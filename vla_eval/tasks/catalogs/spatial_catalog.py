@@ -17,7 +17,6 @@ def _spatial(task: str, horizon_steps: int = 90, **row: Any) -> TaskSpec:  # Any
     """Return a row with the fields that all of them share: there are no candidates."""
     return TaskSpec(
         id=f"{task}-v0",
-        version=1,
         horizon_steps=horizon_steps,
         memory="spatial",
         candidates=None,
