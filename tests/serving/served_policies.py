@@ -10,6 +10,7 @@ import numpy as np
 
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.features import ACTION_NAMES, STATE_NAMES
+from vla_eval.policies.compiled import Compilation
 from vla_eval.serving.host import HostedPolicy
 from vla_eval.serving.observations import observation_reader
 from vla_eval.serving.server import PolicyServer, ServerOptions
@@ -132,7 +133,7 @@ class Running:
         self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
         await PolicyServer(hosted, options).run(self._stop, self._note)
 
-    def _note(self, port: int) -> None:
+    def _note(self, port: int, _compiled: Compilation | None) -> None:
         self.port = port
         self._ready.set()
 

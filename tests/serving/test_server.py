@@ -264,4 +264,4 @@ class TestTheEnd:
         with serving(CountingPolicy()) as server:
             another = PolicyServer(host(CountingPolicy()), ServerOptions(port=server.port))
             with pytest.raises(ServeError, match=f"cannot listen on 127.0.0.1:{server.port}.*Choose another"):
-                asyncio.run(another.run(asyncio.Event(), lambda _: None))
+                asyncio.run(another.run(asyncio.Event(), lambda *_: None))

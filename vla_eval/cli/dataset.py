@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_eval.cli.shared.arguments import add_flags, seeds_argument, task_argument
-from vla_eval.errors import DatasetError
+from vla_eval.errors import DatasetError, RecipeError
 
 if TYPE_CHECKING:
     from vla_eval.data.facts import ImportFacts
@@ -132,7 +132,6 @@ def _convert(args: argparse.Namespace) -> int:
 
 def _changes(args: argparse.Namespace) -> "Changes":
     from vla_eval.data.foreign.changes import Changes
-    from vla_eval.errors import RecipeError
     from vla_eval.tasks.catalog import task_spec
 
     changes = Changes(
@@ -159,7 +158,6 @@ def _convert_control_mode(args: argparse.Namespace) -> int:
     from vla_eval.cli.record import describe
     from vla_eval.cli.terminal.progress import RecordingProgress, stop_on_signals
     from vla_eval.control_modes import action_spec
-    from vla_eval.errors import RecipeError
 
     action_spec(args.control_mode)  # a mistyped name must not wait for the simulator's libraries
     for flag in _asked_for(args):

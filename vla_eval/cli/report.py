@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from vla_eval.cli.shared.arguments import MANY
 from vla_eval.cli.shared.output import add_table_arguments, print_in, print_table
 from vla_eval.cli.terminal.screen import print_markdown
+from vla_eval.errors import ReportError, some_of
 
 if TYPE_CHECKING:
     from vla_eval.storage.run_folder import StoredRun
@@ -98,7 +99,6 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print_published(args: argparse.Namespace) -> int:
-    from vla_eval.errors import ReportError
     from vla_eval.results.table_formats import render_published
 
     if args.published is None or args.html is not None or args.filmstrip is not None:
@@ -108,8 +108,6 @@ def _print_published(args: argparse.Namespace) -> int:
 
 
 def _check_alone(written: str, args: argparse.Namespace) -> None:
-    from vla_eval.errors import ReportError
-
     if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
         raise ReportError(
             f"{written}, which has no --format, --preset, --columns, --wide and --paper. Remove them."
@@ -117,7 +115,6 @@ def _check_alone(written: str, args: argparse.Namespace) -> None:
 
 
 def _write_filmstrips(runs: "Sequence[StoredRun]", folder: Path) -> None:
-    from vla_eval.errors import some_of
     from vla_eval.page.filmstrip import N_EPISODES, write_filmstrips
 
     made = write_filmstrips(runs, folder)

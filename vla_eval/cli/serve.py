@@ -95,15 +95,12 @@ def run(args: argparse.Namespace) -> int:
         print(f"warning: {line}", file=sys.stderr)
     host = f"[{args.host}]" if ":" in args.host else args.host
 
-    def ready(port: int) -> None:
+    def ready(port: int, found: "Compilation | None") -> None:
+        if found is not None:
+            print(f"{found.note(hosted.metadata.name or args.policy)}. That took {found.seconds:.0f} s.")
         print(f"Serving {hosted.metadata.name} at ws://{host}:{port}", flush=True)
 
-    def compiled(found: "Compilation") -> None:
-        print(
-            f"{found.note(hosted.metadata.name or args.policy)}. That took {found.seconds:.0f} s.", flush=True
-        )
-
-    run_server(hosted, options, ready=ready, on_compiled=compiled)
+    run_server(hosted, options, ready=ready)
     return 0
 
 

@@ -5,9 +5,11 @@ import hashlib
 import os
 import subprocess
 import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 from vla_eval.cli.shared.arguments import NUMBERS, task_argument
+from vla_eval.errors import MissingDependencyError, ViewingError
 from vla_eval.lock.switch import own_need
 
 DESCRIPTION = """Open the episodes of RUN that `mikasa-vla eval --capture-rrd …` captured in the rerun viewer.
@@ -61,10 +63,6 @@ def run(args: argparse.Namespace) -> int:
 
 def _viewer() -> str:
     """Return the viewer's program, which `python -m rerun` starts: a child of it would outlive us."""
-    from importlib.util import find_spec
-
-    from vla_eval.errors import MissingDependencyError
-
     if named := os.environ.get("RERUN_CLI_PATH"):  # rerun's own variable
         return named
     package = find_spec("rerun_cli")
@@ -74,7 +72,6 @@ def _viewer() -> str:
 
 
 def _of_run(args: argparse.Namespace) -> list[Path]:
-    from vla_eval.errors import ViewingError
     from vla_eval.storage.run_folder import read_run
     from vla_eval.viz.picking import pick
 
@@ -87,7 +84,6 @@ def _of_run(args: argparse.Namespace) -> list[Path]:
 def _of_dataset(args: argparse.Namespace) -> list[Path]:
     """Write the episodes into the user's cache, from where the viewer opens them."""
     from vla_eval.data.sharing.rrd import EpisodeWish, write_dataset_rrds
-    from vla_eval.errors import ViewingError
     from vla_eval.storage.cache import cached
     from vla_eval.viz.picking import MOST_OPENED
 
@@ -107,8 +103,6 @@ def cache_place(dataset: Path) -> str:
 
 
 def _check_screen(args: argparse.Namespace) -> None:
-    from vla_eval.errors import ViewingError
-
     is_linux = sys.platform == "linux"
     has_screen = not is_linux or os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
     if not args.print and not args.web and not has_screen:

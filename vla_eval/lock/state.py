@@ -7,7 +7,7 @@ import os
 import sys
 import tempfile
 import threading
-from collections.abc import Iterable
+from dataclasses import dataclass, field
 
 TEMPORARY = ("tmp", "pymp-", "mikasa-vla-", "torch", "ray", "wandb", ".wandb", "matplotlib-", "gradio")
 """Beginnings of the names that Python and libraries give to temporary folders and files."""
@@ -26,32 +26,24 @@ COMPILED_VARIABLES = ("TORCHINDUCTOR_CACHE_DIR", "TRITON_CACHE_DIR")
 """Folders from which torch runs the Python that it has written there."""
 
 
+@dataclass
 class State:
-    """What this process may do.
+    """What this process may do."""
 
-    Attributes:
-        is_on: whether anything is refused at all.
-        has_hook: whether the audit hook is installed; it cannot be removed.
-        network, everything: why all connections, or all, are let through; None: they are not.
-        code: folders that Python files may be run from.
-        foreign: folders of checkpoints and datasets, which may lie within those of `code`.
-        writes: files and folders that may be written.
-        finder: stands first in `sys.meta_path`.
-        ours: of each thread, how many `own_need` are open.
-    """
-
-    def __init__(self) -> None:
-        self.is_on = False
-        self.has_hook = False
-        self.network: str | None = None
-        self.everything: str | None = None
-        self.code: tuple[str, ...] = ()
-        self.foreign: set[str] = set()
-        self.tools: frozenset[str] = frozenset()
-        self.hosts: set[str] = set()
-        self.writes: set[str] = set()
-        self.finder: importlib.abc.MetaPathFinder | None = None
-        self.ours = threading.local()
+    is_on: bool = False  # whether anything is refused at all
+    has_hook: bool = False  # whether the audit hook is installed; it cannot be removed
+    # why all connections, or all, are let through; None: they are not
+    network: str | None = None
+    everything: str | None = None
+    code: tuple[str, ...] = ()  # folders that Python files may be run from
+    # folders of checkpoints and datasets, which may lie within those of `code`
+    foreign: set[str] = field(default_factory=set)
+    tools: frozenset[str] = frozenset()  # programs of the system that libraries may start
+    hosts: set[str] = field(default_factory=set)  # names that may be looked up
+    writes: set[str] = field(default_factory=set)  # files and folders that may be written
+    finder: importlib.abc.MetaPathFinder | None = None  # stands first in `sys.meta_path`
+    # of each thread, how many `own_need` are open
+    ours: threading.local = field(default_factory=threading.local)
 
     @property
     def refuses(self) -> bool:
@@ -120,11 +112,6 @@ def library_folders() -> set[str]:
 @functools.cache
 def _resolved(folder: str) -> str:
     return os.path.realpath(folder)
-
-
-def may_all_run(paths: Iterable[str | None]) -> bool:
-    """Whether all of these are installed."""
-    return all(path is not None and may_run(path) for path in paths)
 
 
 def _is_within(place: str, folder: str) -> bool:

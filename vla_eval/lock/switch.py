@@ -13,7 +13,7 @@ from typing import Any  # finders and specs of modules
 
 from vla_eval.errors import LockedImportError
 from vla_eval.lock.events import TOOLS, audit, refused
-from vla_eval.lock.state import STATE, code_folders, library_folders, may_all_run
+from vla_eval.lock.state import STATE, code_folders, library_folders, may_run
 
 OFF_VARIABLE = "MIKASA_VLA_NO_LOCK"
 """Environment variable that `--no-lock` sets: this process and those that it starts are not locked."""
@@ -133,7 +133,8 @@ class _InstalledOnly(importlib.abc.MetaPathFinder):
                 continue
             places: list[str | None]
             places = [spec.origin] if spec.has_location else list(spec.submodule_search_locations or ())
-            if STATE.refuses and finder not in self._trusted and not may_all_run(places):
+            are_installed = all(place is not None and may_run(place) for place in places)
+            if STATE.refuses and finder not in self._trusted and not are_installed:
                 raise LockedImportError(str(refused(f"import the module '{fullname}' from {places[0]}")))
             return spec
         return None

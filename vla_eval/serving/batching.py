@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from vla_eval.core import ActionChunk, BatchPolicy, EpisodeStart, ForgettingPolicy, ObservationWindow, Policy
 from vla_eval.episode_log import chunk_problem
@@ -34,24 +34,18 @@ class Inference(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Begin:
+    slot: int
     start: EpisodeStart
     done: Future[None] = field(default_factory=Future)
-
-    @property
-    def slot(self) -> int:
-        return self.start.slot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Infer:
+    slot: int
     start: EpisodeStart
     window: ObservationWindow
     asked_at: float
     done: Future[Inference] = field(default_factory=Future)
-
-    @property
-    def slot(self) -> int:
-        return self.window.slot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,7 +64,7 @@ _Request = _Begin | _Infer | _Forget
 class Batcher:
     """Asks a policy on behalf of many, with `n_rows` in a pass; nobody else may call it any more.
 
-    `prepare` is called first, in the thread that asks; `prepared` has what it raises.
+    `prepare` is called first, in the thread that asks; `prepared` has what it returns or raises.
     """
 
     def __init__(
@@ -80,7 +74,7 @@ class Batcher:
         n_rows: int,
         action_dims: Sequence[str],
         metrics: ServerMetrics,
-        prepare: Callable[[], object] = lambda: None,
+        prepare: Callable[[], Any] = lambda: None,  # Any: what `prepared` is to have
     ) -> None:
         self._policy, self._n_rows, self._metrics = policy, n_rows, metrics
         self._action_dims = action_dims
@@ -90,16 +84,17 @@ class Batcher:
         self._prepare_thread = prepare
         self._unready: dict[int, PolicyFailure] = {}  # slots whose episode could not be begun
         self._thread = threading.Thread(target=self._work, name="inference", daemon=True)
-        self.prepared: Future[None] = Future()
+        self.prepared: Future[Any] = Future()
         self._thread.start()
 
     def begin(self, start: EpisodeStart) -> Future[None]:
         """Begin an episode in its slot, after what was asked for that slot before."""
-        return self._put(_Begin(start=start)).done
+        return self._put(_Begin(slot=start.slot, start=start)).done
 
     def infer(self, start: EpisodeStart, window: ObservationWindow) -> Future[Inference]:
         """Infer a chunk for an episode that was begun."""
-        return self._put(_Infer(start=start, window=window, asked_at=time.monotonic())).done
+        request = _Infer(slot=window.slot, start=start, window=window, asked_at=time.monotonic())
+        return self._put(request).done
 
     def forget(self, slot: int) -> None:
         """Have the policy forget a slot, after what was asked for it before."""
@@ -127,11 +122,10 @@ class Batcher:
 
     def _work(self) -> None:
         try:
-            self._prepare_thread()
+            self.prepared.set_result(self._prepare_thread())
         except BaseException as exc:  # also SystemExit: raised where it is waited for
             self.prepared.set_exception(exc)
             return
-        self.prepared.set_result(None)
         while True:
             with self._changed:
                 while not self._queue and not self._is_closed:

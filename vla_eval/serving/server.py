@@ -52,6 +52,9 @@ HAS_ORIGIN = (
 )
 EXIT_UNANSWERED = 1  # of a server whose policy was still computing when it ended
 
+Ready = Callable[[int, Compilation | None], None]
+"""Called with the port, and with what was found of a network that was compiled."""
+
 logger = logging.getLogger(__name__)
 
 
@@ -91,16 +94,15 @@ class PolicyServer:
         hosted: HostedPolicy,
         options: ServerOptions,
         metrics: ServerMetrics | None = None,
-        on_compiled: Callable[[Compilation], None] = lambda _: None,
     ) -> None:
-        self._hosted, self._options, self._on_compiled = hosted, options, on_compiled
+        self._hosted, self._options = hosted, options
         self._metrics = metrics or ServerMetrics()
         self._batcher = Batcher(
             hosted.policy,
             n_rows=hosted.n_rows,
             action_dims=hosted.metadata.action_dims or (),
             metrics=self._metrics,
-            prepare=self._warm_up,
+            prepare=hosted.warm_up,
         )
         self._sessions = SessionTable(
             hosted.reader,
@@ -119,11 +121,6 @@ class PolicyServer:
         self._numbers = itertools.count()
         self._is_stopping = False
 
-    def _warm_up(self) -> None:
-        compiled = self._hosted.warm_up()
-        if compiled is not None:
-            self._on_compiled(compiled)
-
     async def _is_prepared(self, stop: asyncio.Event) -> bool:
         """Wait until the policy can be asked; False: it was stopped meanwhile."""
         prepared = asyncio.wrap_future(self._batcher.prepared)
@@ -135,12 +132,11 @@ class PolicyServer:
             prepared.result()  # raises what went wrong
         return prepared.done()
 
-    async def run(self, stop: asyncio.Event, ready: Callable[[int], None]) -> bool:
+    async def run(self, stop: asyncio.Event, ready: Ready) -> bool:
         """Serve until `stop` is set; then finish the pass under way, and close all connections.
 
-        Compiles the policy's network before, if that was asked for. Calls `ready` once, with the port, when
-        clients can connect. Returns whether the policy has answered;
-        if not, its thread still runs.
+        Compiles the policy's network before, if that was asked for. Calls `ready` once when clients can
+        connect. Returns whether the policy has answered; if not, its thread still runs.
 
         Raises:
             ServeError: the address cannot be listened on.
@@ -167,7 +163,8 @@ class PolicyServer:
             ) from exc
         tasks = [asyncio.create_task(task()) for task in (self._log, self._drop_idle)]
         try:
-            ready(int(next(iter(server.sockets)).getsockname()[1]))
+            port = int(next(iter(server.sockets)).getsockname()[1])
+            ready(port, self._batcher.prepared.result())
             await stop.wait()
         finally:
             for task in tasks:
@@ -233,17 +230,15 @@ def run_server(
     hosted: HostedPolicy,
     options: ServerOptions,
     *,
-    ready: Callable[[int], None],
+    ready: Ready,
     ends: Callable[[], None] | None = None,
     metrics: ServerMetrics | None = None,
-    on_compiled: Callable[[Compilation], None] = lambda _: None,
 ) -> None:
     """Serve until SIGINT or SIGTERM; a second one ends the process at once.
 
     Within `END_SECONDS` of the first one the process has ended, whatever the policy does. `ready` is called
-    once, with the port, when clients can connect; `on_compiled` before, if a network was compiled. `ends` is
-    called in a thread of its own: when it returns, the server stops as well. Errors are those of
-    `PolicyServer.run`.
+    once when clients can connect. `ends` is called in a thread of its own: when it returns, the server stops
+    as well. Errors are those of `PolicyServer.run`.
     """
 
     async def serve_until_stopped() -> bool:
@@ -267,7 +262,7 @@ def run_server(
                     loop.call_soon_threadsafe(stop.set)
 
             threading.Thread(target=watch, name="end of serving", daemon=True).start()
-        return await PolicyServer(hosted, options, metrics, on_compiled).run(stop, ready)
+        return await PolicyServer(hosted, options, metrics).run(stop, ready)
 
     has_ended = asyncio.run(serve_until_stopped())
     if not has_ended:  # Python would wait for its thread, or for threads that it has started

@@ -177,14 +177,12 @@ def serve_main(connection: Connection, shared: SharedStage, log: Path) -> None:
         os.environ[VISIBLE_GPUS] = job.gpu  # before torch looks for GPUs
     try:
         hosted = host_policy(job.host)
-        found: list[Compilation] = []
         run_server(
             hosted,
             ServerOptions(host=job.address, port=0, api_key=job.api_key),
-            ready=lambda port: send_message(
-                connection, ServerReady(port=port, metadata=hosted.metadata, compiled=next(iter(found), None))
+            ready=lambda port, compiled: send_message(
+                connection, ServerReady(port=port, metadata=hosted.metadata, compiled=compiled)
             ),
-            on_compiled=found.append,
             ends=lambda: _wait_for_parent(connection),
             metrics=ServerMetrics(on_pass=functools.partial(add_count, shared)),
         )

@@ -85,26 +85,12 @@ class ServerMetadata:
 
     def to_wire(self) -> dict[str, Any]:
         """Return the first message of a server of this wire."""
-        message: dict[str, Any] = {
-            one.name: getattr(self, one.name)
-            for one in fields(self)
-            if one.name not in ("weights_known", "other", "training_seeds", "sentences")
-        }
-        if self.training_seeds is not None:
-            message["training_seeds"] = {
-                task: [[one.first, one.last] for one in seeds] for task, seeds in self.training_seeds.items()
-            }
-        if self.sentences is not None:
-            message["sentences"] = {task: list(own) for task, own in self.sentences.items()}
+        left_out = {"weights_known", "other"}
+        left_out |= {name for name in ("training_seeds", "sentences") if getattr(self, name) is None}
         if not self.weights_known:
-            del message["weights_sha256"]
-        if self.cameras is not None:
-            message["cameras"] = {name: image._asdict() for name, image in self.cameras.items()}
-        if self.state_layouts is not None:
-            message["state_layouts"] = {name: list(dims) for name, dims in self.state_layouts.items()}
-        message["versions"] = None if self.versions is None else dict(self.versions)
-        plain = {key: list(value) if isinstance(value, tuple) else value for key, value in message.items()}
-        return {**self.other, **plain}
+            left_out.add("weights_sha256")
+        names = [one.name for one in fields(self) if one.name not in left_out]
+        return {**self.other, **{name: _on_wire(getattr(self, name)) for name in names}}
 
     def identity(self) -> dict[str, Any]:
         """Return what is compared when a run is resumed, as JSON can hold it.
@@ -137,6 +123,17 @@ class ServerMetadata:
                 f"same version of mikasa-vla-eval at both ends."
             )
         return metadata
+
+
+def _on_wire(value: Any) -> Any:
+    """Return a field as a message holds it."""
+    if isinstance(value, CameraImage):
+        return value._asdict()
+    if isinstance(value, SeedRange):
+        return [value.first, value.last]
+    if isinstance(value, Mapping):
+        return {name: _on_wire(item) for name, item in value.items()}
+    return [_on_wire(item) for item in value] if isinstance(value, tuple) else value
 
 
 def _read(value: object, name: str, reader: "_Reader", *, where: str) -> Any:

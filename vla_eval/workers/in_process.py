@@ -1,7 +1,6 @@
 """The backend without worker processes, for debuggers: jobs are done one after another in this one."""
 
 from collections.abc import Hashable, Iterator, Sequence
-from dataclasses import dataclass
 from multiprocessing.sharedctypes import RawArray
 from pathlib import Path
 from typing import Self, cast
@@ -64,7 +63,6 @@ class InProcessPool[J: Job, A]:
         self._runner = self._loaded = None
 
 
-@dataclass(frozen=True, slots=True)
 class InProcessBackend:
     """This process; see `Backend`."""
 

@@ -1,7 +1,6 @@
 """The backend of one machine: a pool of processes, and services on the loopback address."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.workers.jobs import Job
@@ -19,7 +18,6 @@ class LocalService(WorkerProcess):
     gpu: str | None = None
 
 
-@dataclass(frozen=True, slots=True)
 class LocalBackend:
     """This machine; see `Backend`."""
 
