@@ -12,7 +12,7 @@ from vla_eval.cli.main import main
 from vla_eval.data.manifest import read_manifest
 from vla_eval.data.opening import open_dataset, open_local_dataset
 from vla_eval.data.recording import record as recording_module
-from vla_eval.data.recording.shard_writer import Format, create_dataset
+from vla_eval.data.recording.shard_writer import new_dataset
 from vla_eval.data.replaying import replay as replay_module
 from vla_eval.features import ACTION_NAMES, CAMERA_KEYS, STATE_NAMES, EncoderSettings, dataset_features
 from vla_eval.tasks.interface import ACTION, CAMERAS, states
@@ -71,8 +71,8 @@ def colour_frame(rgb: tuple[int, int, int]) -> np.ndarray[Any, np.dtype[np.uint8
 
 
 def test_all_nine_cue_colours_survive_the_video(tmp_path: Path) -> None:
-    dataset = create_dataset(
-        tmp_path / "colours", Format(state="eef", encoder=EncoderSettings(), max_frames=len(COLORS))
+    dataset = new_dataset(
+        tmp_path / "colours", dataset_features("eef"), encoder=EncoderSettings(), max_frames=len(COLORS)
     )
     for color in COLORS:
         frame: dict[str, Any] = {

@@ -12,7 +12,6 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
@@ -129,9 +128,7 @@ class RunFolder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, exc: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, exc: BaseException | None, *_: object) -> None:
         """Close the folder; a new one is removed if an error came before its first episode."""
         if isinstance(exc, Exception) and self._started is not None and not self._has_lines:
             self._started.undo()

@@ -16,14 +16,12 @@ import os
 import shutil
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from vla_eval.data.recording.demonstrations import Attempt
-from vla_eval.data.recording.jobs import Origin
 from vla_eval.errors import DatasetError, RunFolderError
 from vla_eval.lock.switch import let_write
-from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device, without_device
+from vla_eval.storage.continuing import check_allowed, continued, device_changes, known_device
 from vla_eval.storage.durable import LineFile, cut_tail, read_lines, sync_path, whole_lines
 from vla_eval.storage.folders import other_files
 from vla_eval.storage.run_file import RUN_FILE, RunDescription, RunFile
@@ -44,7 +42,7 @@ class RecordingFolder:
         """Use `open`."""
         self.out = out
         self._started = started
-        self._run_file = run_file
+        self.run_file = run_file
         self._attempts: dict[str, LineFile] = {}
 
     @classmethod
@@ -70,28 +68,21 @@ class RecordingFolder:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, value: BaseException | None, *_: object) -> None:
         """Close the files and let other processes in; a start that failed leaves nothing behind."""
         for file in self._attempts.values():
             file.close()
         self._attempts = {}
         self._started.leave(failed=isinstance(value, Exception))
 
-    @property
-    def origin(self) -> Origin:
-        """With what it is made."""
-        return origin_of(self._run_file)
-
     def note_device(self, device: Mapping[str, str], *, allow_change: bool) -> None:
         """Record the device: all images of a dataset come from one, or `RunChangedError` is raised."""
-        changes = device_changes(self._run_file, device)
+        changes = device_changes(self.run_file, device)
         check_allowed(changes, shown=self.out, allowed=allow_change)
-        known = known_device(self._run_file)
+        known = known_device(self.run_file)
         if dict(device) != known:
-            self._run_file = self._run_file.with_device({**known, **device}, changes)
-            self._run_file.save(self.out / STATE_FOLDER)
+            self.run_file = self.run_file.with_device({**known, **device}, changes)
+            self.run_file.save(self.out / STATE_FOLDER)
 
     def logs(self) -> Path:
         """Return the folder of the workers' logs."""
@@ -128,16 +119,6 @@ def read_attempts(out: Path, task: str) -> dict[int, Attempt]:
 def shard_path(out: Path, task: str, index: int) -> Path:
     """Return where a shard of a recording is, or would be."""
     return out / STATE_FOLDER / task / SHARDS / f"shard-{index:05d}"
-
-
-def origin_of(run_file: RunFile) -> Origin:
-    """Return with what a recording was made: as it was started, and the device that rendered."""
-    started = run_file.description
-    return Origin(
-        recipe_files=started.recipes,
-        environment=without_device(started.environment),
-        device={name: str(value) for name, value in known_device(run_file).items()},
-    )
 
 
 def remove_shards(out: Path, task: str) -> None:

@@ -1,6 +1,6 @@
 """What a recording consists of, as data that is sent to workers: tries, shards, joins."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +11,8 @@ from vla_eval.data.facts import DatasetFacts
 from vla_eval.data.manifest import FailedSeed
 from vla_eval.data.recording.demonstrations import SLOT, Attempt
 from vla_eval.evaluation.episode_jobs import EpisodeGroup
-from vla_eval.storage.run_file import JsonValue
+from vla_eval.storage.continuing import known_device, without_device
+from vla_eval.storage.run_file import RunFile
 from vla_eval.workers.jobs import Job
 
 
@@ -99,15 +100,6 @@ class JoinJob(_TaskJob):
         return f"{self.plan.task}, joining the shards"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Origin:
-    """Digests of recipes and weights, environment and device of a recording; see `DatasetFacts`."""
-
-    recipe_files: Mapping[str, str]
-    environment: Mapping[str, JsonValue]
-    device: Mapping[str, str]
-
-
 def shard_jobs(plan: TaskPlan, kept: Sequence[Attempt], place: Callable[[int], Path]) -> tuple[ShardJob, ...]:
     """Return the jobs that render the kept attempts; `place` says where the shard of a number appears."""
     size = plan.recipe.episodes_per_shard
@@ -123,9 +115,10 @@ def shard_jobs(plan: TaskPlan, kept: Sequence[Attempt], place: Callable[[int], P
 
 
 def join_job(
-    plan: TaskPlan, path: Path, *, shards: Sequence[ShardJob], failed: Sequence[Attempt], origin: Origin
+    plan: TaskPlan, path: Path, *, shards: Sequence[ShardJob], failed: Sequence[Attempt], run_file: RunFile
 ) -> JoinJob:
     """Return the job that makes the dataset of a task at `path` from all of its shards."""
+    started = run_file.description
     facts = DatasetFacts(
         complete=True,
         name=plan.recipe.name,
@@ -138,9 +131,9 @@ def join_job(
         n_failed_seeds=len(failed),
         recipe=content_of(plan.recipe, options=OPTION_FIELDS),
         recipe_sha256=fingerprint(plan.recipe),
-        recipe_files=dict(origin.recipe_files),
-        environment=dict(origin.environment),
-        device=dict(origin.device),
+        recipe_files=dict(started.recipes),
+        environment=without_device(started.environment),
+        device={name: str(value) for name, value in known_device(run_file).items()},
         files={},
     )
     return JoinJob(

@@ -10,7 +10,6 @@ from vla_eval.data.facts import DatasetFacts
 from vla_eval.data.recording.folder import (
     ATTEMPTS_FILE,
     STATE_FOLDER,
-    origin_of,
     read_attempts,
     remove_shards,
     shard_path,
@@ -153,9 +152,7 @@ def _refuse_other_attempts(task: TaskPlan, first: _Tried, other: _Tried) -> None
 def _join(task: MergedTask, run_file: RunFile, draft: Path) -> DatasetFacts:
     name = task.plan.task
     jobs = shard_jobs(task.plan, task.selection.kept, lambda index: shard_path(draft, name, index))
-    job = join_job(
-        task.plan, draft / name, shards=jobs, failed=task.selection.failed, origin=origin_of(run_file)
-    )
+    job = join_job(task.plan, draft / name, shards=jobs, failed=task.selection.failed, run_file=run_file)
     facts = join_dataset(job)
     remove_shards(draft, name)
     return facts

@@ -260,7 +260,7 @@ class _Recorder:
     def _join(self, task: TaskPlan, selection: Selection, shards: Sequence[ShardJob]) -> None:
         self._begin(task, "joining", n_done=0)
         path = self.folder.out / task.task
-        job = join_job(task, path, shards=shards, failed=selection.failed, origin=self.folder.origin)
+        job = join_job(task, path, shards=shards, failed=selection.failed, run_file=self.folder.run_file)
         for _ in self._answers(JobList([job])):
             self.observer.on_progress(n_done=task.recipe.episodes)
 

@@ -1,9 +1,7 @@
 """Write episodes as small LeRobotDatasets that appear whole or not at all, and put them together."""
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self  # Any: lerobot is untyped
 
 import av
@@ -24,15 +22,7 @@ from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries,
 from vla_eval.data.opening import join_datasets, video_decoder
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
-from vla_eval.features import (
-    ACTION_NAMES,
-    CAMERA_KEYS,
-    FPS,
-    IMAGE_SIZE_PX,
-    EncoderSettings,
-    StateKind,
-    dataset_features,
-)
+from vla_eval.features import CAMERA_KEYS, FPS, EncoderSettings
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 
 ROBOT_TYPE = "panda_wristcam"
@@ -42,28 +32,20 @@ SHARD_HISTOGRAMS = MIKASA_FOLDER / "histograms.npz"
 ENCODER_THREADS = 1
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Format:
-    """What shards must have in common to become one dataset; no episode has more than `max_frames`."""
-
-    state: StateKind
-    encoder: EncoderSettings
-    max_frames: int
-    action_names: tuple[str, ...] = ACTION_NAMES
-    image_size_px: int = IMAGE_SIZE_PX
-
-
 class ShardWriter:
     """Writes one shard to `path`; a context manager that leaves either the whole shard or nothing."""
 
-    def __init__(self, path: Path, format: Format) -> None:
+    def __init__(
+        self, path: Path, features: dict[str, Any], *, encoder: EncoderSettings, max_frames: int
+    ) -> None:
+        """Take what shards must have in common to become one dataset, see `new_dataset`."""
         self._path = path
         remove_drafts(path)
         self._draft = draft_path(path)
         self._draft.parent.mkdir(parents=True, exist_ok=True)
         self._episodes: list[RecordedEpisode] = []
         self._histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
-        self._dataset = create_dataset(self._draft, format)
+        self._dataset = new_dataset(self._draft, features, encoder=encoder, max_frames=max_frames)
 
     def __enter__(self) -> Self:
         return self
@@ -82,9 +64,7 @@ class ShardWriter:
         self._dataset.save_episode()
         self._episodes.append(episode)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is not None:
             remove_drafts(self._path)
             return
@@ -93,14 +73,6 @@ class ShardWriter:
         write_lines(self._draft / SHARD_EPISODES, self._episodes)
         np.savez_compressed(self._draft / SHARD_HISTOGRAMS, **self._histograms)  # type: ignore[arg-type]
         publish(self._draft, self._path)
-
-
-def create_dataset(root: Path, format: Format) -> Any:  # Any: lerobot is untyped
-    """Return a new LeRobotDataset for recordings of a format."""
-    features = dataset_features(
-        format.state, action_names=format.action_names, image_size_px=format.image_size_px
-    )
-    return new_dataset(root, features, encoder=format.encoder, max_frames=format.max_frames)
 
 
 def new_dataset(

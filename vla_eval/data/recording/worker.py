@@ -35,11 +35,11 @@ from vla_eval.data.recording.jobs import (
     ShardJob,
     TaskPlan,
 )
-from vla_eval.data.recording.shard_writer import Format, ShardWriter, join_shards
+from vla_eval.data.recording.shard_writer import ShardWriter, join_shards
 from vla_eval.data.simulator_runner import SimulatorRunner
 from vla_eval.errors import VlaEvalError
 from vla_eval.evaluation.worker import make_policy
-from vla_eval.features import CAMERA_KEYS, frame_values
+from vla_eval.features import CAMERA_KEYS, dataset_features, frame_values
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 from vla_eval.storage.durable import DISK_TROUBLE, storage_full
 from vla_eval.workers.inside import Heartbeat
@@ -87,14 +87,12 @@ class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
     def _write_shard(self, job: ShardJob) -> Path:
         plan = job.plan
         env = self._make_env(dataclasses.replace(plan.group.env, cameras=tuple(CAMERA_KEYS)))
-        form = Format(
-            state=plan.recipe.state,
-            encoder=plan.recipe.encoder,
-            max_frames=env.spec.horizon_steps,
-            action_names=env.spec.action.dims,
-            image_size_px=env.spec.cameras[0].height_px,
+        size_px, max_frames = env.spec.cameras[0].height_px, env.spec.horizon_steps
+        features = dataset_features(
+            plan.recipe.state, action_names=env.spec.action.dims, image_size_px=size_px
         )
-        with ShardWriter(job.path, form) as writer:
+        encoder = plan.recipe.encoder
+        with ShardWriter(job.path, features, encoder=encoder, max_frames=max_frames) as writer:
             for index, one in enumerate(job.attempts, start=job.first_index):
                 start = plan.start(one.seed, horizon_steps=one.n_steps)
                 log = replay_attempt(env, start, one, heartbeat=self._heartbeat)
