@@ -22,20 +22,12 @@ def configured[C](
     where: str,
     edit: Callable[[dict[str, Any]], None] = lambda _data: None,
 ) -> C:
-    """Return a configuration, its file, or the fields `start`, with what is given on top.
+    """Return a configuration, its file, or the fields `start`, with what is `given` on top.
 
-    Args:
-        cls: the class of the configuration.
-        config: one, or a file, or a name in `folder`; None: the arguments say it all.
-        given: field -> value; None: the argument was not given.
-        folder: where names are looked up.
-        start: the fields without a configuration.
-        needed: field -> the argument that must give it if there is no configuration.
-        where: the function, for messages.
-        edit: changes the data after that.
-
-    Raises:
-        RecipeError: an argument is missing, or a field does not exist or cannot have this value.
+    Names are looked up in `folder`. A value of None was not given. `needed` has field -> the argument that
+    must give it if there is no configuration; `where` is the function, for messages, and `edit` changes the
+    data at the end.
+    `RecipeError`: an argument is missing, or a field does not exist or cannot have this value.
     """
 
     def complete(data: dict[str, Any]) -> None:

@@ -1,8 +1,6 @@
 """`mikasa-vla check`: does a policy, or the server of one, keep its contract?"""
 
 import argparse
-import functools
-import sys
 
 from vla_eval.cli.shared.arguments import api_key_of, task_argument
 from vla_eval.errors import RecipeError
@@ -64,6 +62,7 @@ def _check_server(args: argparse.Namespace) -> list[str]:
 
 
 def _check_policy(args: argparse.Namespace) -> list[str]:
+    from vla_eval.cli.shared.output import say
     from vla_eval.policies.entries import load_policy_entry
     from vla_eval.testing.check_recipe import check_recipe
 
@@ -71,7 +70,6 @@ def _check_policy(args: argparse.Namespace) -> list[str]:
         raise RecipeError(
             "--api-key-env and --timeout-seconds are for the address of a server, ws://HOST:PORT."
         )
-    say = functools.partial(print, file=sys.stderr, flush=True)
     policy = load_policy_entry(args.policy)
     task = args.task or policy.task or DEFAULT_TASK
     return check_recipe(policy, task=task, report=_print_met, say=say)

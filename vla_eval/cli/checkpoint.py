@@ -169,12 +169,10 @@ def _value(args: argparse.Namespace, flag: Flag) -> Any:
 def _fetch(args: argparse.Namespace) -> list[str]:
     from vla_eval.checkpoints.bases import FOLDER, find_base
     from vla_eval.checkpoints.fetching import fetch_base
+    from vla_eval.cli.shared.output import say
 
     base = find_base(args.name)
     out = args.out or FOLDER / base.name
-
-    def say(line: str) -> None:
-        print(line, file=sys.stderr, flush=True)
 
     return [str(fetch_base(base, out, revision=args.revision, say=say))]
 

@@ -78,33 +78,24 @@ class ImportedEpisode:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImportFacts:
-    """What a converted dataset is, where it came from, and what it does not have; for the rest see `Facts`.
-
-    Attributes:
-        source_layout: see `foreign.episodes.Layout`; or `adopted`, if the files are those of the source.
-        instruction_source: where the instruction comes from: `source`, or the prompt set of the task.
-        executable_by_pd_ee_delta_pose: whether this project's environments can execute the actions.
-        absent, left_out: fields of our own datasets that the source lacks; arrays that were not taken over.
-        is_checked: False for what an older version wrote.
-        converted: what was changed because it was asked for, a sentence each.
-    """
+    """What a converted dataset is, where it came from, and what it lacks; for the rest see `Facts`."""
 
     complete: bool
-    source_layout: str
+    source_layout: str  # see `foreign.episodes.Layout`; or `adopted`, if the files are those of the source
     task: str | None
-    instruction_source: str
+    instruction_source: str  # where the instruction comes from: `source`, or the prompt set of the task
     state: str
     control_mode: str
-    executable_by_pd_ee_delta_pose: bool
-    absent: tuple[str, ...]
-    left_out: tuple[str, ...]
+    executable_by_pd_ee_delta_pose: bool  # whether this project's environments can execute the actions
+    absent: tuple[str, ...]  # fields of our own datasets that the source lacks
+    left_out: tuple[str, ...]  # arrays that were not taken over
     n_frames: Count
     episodes: tuple[ImportedEpisode, ...]
     source_files: dict[str, FileDigest]
     files: dict[str, FileDigest]
     vla_eval_version: str
-    is_checked: bool = False
-    converted: tuple[str, ...] = ()
+    is_checked: bool = False  # False for what an older version wrote
+    converted: tuple[str, ...] = ()  # what was changed because it was asked for, a sentence each
     kept: tuple[str, ...] = ()
 
     @property

@@ -157,7 +157,15 @@ def _groups_of_all(
     groups: list[EpisodeGroup] = []
     left_out: list[str] = []
     for task in tasks:
-        env = _env_settings(config, task)
+        env = EnvSettings(
+            task=task.id,
+            kwargs=config.env,
+            simulator=config.simulator,
+            sim_backend=config.sim_backend,
+            render=config.render,
+            appearance=config.appearance,
+            n_slots=config.slots_per_worker,
+        )
         offered = describe_env(env)
         _check_changes(config, task, offered)
         on_task = partial(
@@ -175,18 +183,6 @@ def _groups_of_all(
             n_rows = config.inference_max_batch if policy.part(0) in shared else config.slots_per_worker
             groups.extend(_groups(config, task, policy, on_task, n_rows=n_rows))
     return groups, left_out
-
-
-def _env_settings(config: EvalConfig, task: TaskSpec) -> EnvSettings:
-    return EnvSettings(
-        task=task.id,
-        kwargs=config.env,
-        simulator=config.simulator,
-        sim_backend=config.sim_backend,
-        render=config.render,
-        appearance=config.appearance,
-        n_slots=config.slots_per_worker,
-    )
 
 
 def _jobs(config: EvalConfig, group: EpisodeGroup) -> Iterable[EpisodeJob]:

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 PREFIX = "mikasa_vla"
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
@@ -65,14 +65,14 @@ class ServerMetrics:
         now, counts, before = self._clock(), self.counts, self._reported
         seconds = now - self._reported_at
         self._reported, self._reported_at = counts, now
-        n_inferences = counts.n_inferences - before.n_inferences
-        n_passes = counts.n_passes - before.n_passes
-        queue_seconds = counts.queue_seconds - before.queue_seconds
-        infer_seconds = counts.infer_seconds - before.infer_seconds
+        names = [one.name for one in fields(Counts)]
+        new = Counts(**{name: getattr(counts, name) - getattr(before, name) for name in names})
+        rate = new.n_inferences / seconds if seconds > 0 else 0.0
         return (
-            f"sessions {n_sessions}, inferences/s {_ratio(n_inferences, seconds):.2f}, mean batch "
-            f"{_shown(n_inferences, n_passes)}, queue ms {_shown(1000 * queue_seconds, n_inferences)}, "
-            f"pass ms {_shown(1000 * infer_seconds, n_passes)}, errors {counts.n_errors - before.n_errors}"
+            f"sessions {n_sessions}, inferences/s {rate:.2f}, mean batch "
+            f"{_shown(new.n_inferences, new.n_passes)}, queue ms "
+            f"{_shown(1000 * new.queue_seconds, new.n_inferences)}, pass ms "
+            f"{_shown(1000 * new.infer_seconds, new.n_passes)}, errors {new.n_errors}"
         )
 
     def prometheus(self, *, n_sessions: int, n_connections: int) -> str:
@@ -91,10 +91,6 @@ class ServerMetrics:
             f"# HELP {PREFIX}_{name} {text}\n# TYPE {PREFIX}_{name} {kind}\n{PREFIX}_{name} {value}\n"
             for name, kind, text, value in rows
         )
-
-
-def _ratio(part: float, whole: float) -> float:
-    return part / whole if whole > 0 else 0.0
 
 
 def _shown(part: float, whole: float) -> str:

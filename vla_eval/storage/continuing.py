@@ -37,12 +37,8 @@ def continued(
 ) -> RunFile:
     """Return what `run.json` must hold from now on; nothing is written. Raises `RunChangedError`.
 
-    Args:
-        folder: that of `run.json`, if there is one.
-        description: what the run is started with; the device is not compared.
-        shown: the folder that messages name.
-        allow_environment_change: continue although commit or versions have changed.
-        may_grow: more of what is planned, the rest being the same, is not a change.
+    `folder` is that of `run.json`, `shown` the one that messages name. The device of the description is not
+    compared; with `may_grow`, more of what is planned, the rest being the same, is not a change.
     """
     session = Session(
         started_at=datetime.now(UTC).isoformat(timespec="seconds"),

@@ -270,14 +270,7 @@ def check_startable(
     allow_environment_change: bool,
     groups: Collection[tuple[str, str, int]],
 ) -> tuple[EpisodeRecord, ...]:
-    """Refuse what `RunFolder.open` would refuse, and write nothing; arguments as there.
-
-    Returns:
-        The records that are there already; none for a new folder.
-
-    Raises:
-        RunChangedError, RunFolderError: see `RunFolder.open`.
-    """
+    """Refuse what `RunFolder.open` would refuse, and write nothing; return the records that are there."""
     check_folder(path)
     run_file = continued(
         path, description, shown=path, allow_environment_change=allow_environment_change, may_grow=True

@@ -34,7 +34,9 @@ def leave_working_directory() -> None:
     with contextlib.suppress(FileNotFoundError):  # the working directory was deleted: nothing to search
         here = os.getcwd()
         has_empty_entry = search_path not in ("", os.pathsep.join(named))
-        is_first = not sys.flags.safe_path and sys.path[:1] == [here] and _is_started_as_module()
+        spec = getattr(sys.modules["__main__"], "__spec__", None)
+        is_started_as_module = spec is not None and spec.name == MODULE
+        is_first = not sys.flags.safe_path and sys.path[:1] == [here] and is_started_as_module
         if (has_empty_entry or is_first) and not any(os.path.realpath(entry) == here for entry in named):
             if Path(here) == CHECKOUT:
                 named.insert(0, here)
@@ -45,11 +47,6 @@ def leave_working_directory() -> None:
         os.environ[SEARCH_PATH] = os.pathsep.join(named)
     else:
         os.environ.pop(SEARCH_PATH, None)
-
-
-def _is_started_as_module() -> bool:
-    spec = getattr(sys.modules["__main__"], "__spec__", None)
-    return spec is not None and spec.name == MODULE
 
 
 def python_command(*arguments: str) -> list[str]:

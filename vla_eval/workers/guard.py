@@ -98,11 +98,12 @@ def end_descendants() -> None:
     """Kill all descendants of this process, which must be a subreaper; wait until they are gone."""
     deadline, pause_seconds = time.monotonic() + REAP_SECONDS, 0.001
     while True:
-        for process in psutil.Process().children(recursive=True):
+        processes = psutil.Process().children(recursive=True)
+        for process in processes:
             with contextlib.suppress(psutil.NoSuchProcess, psutil.AccessDenied):  # gone, or another user's
                 process.kill()
         list(_reaped())
-        if not _has_children() or time.monotonic() > deadline:
+        if not processes or time.monotonic() > deadline:
             return
         time.sleep(pause_seconds)
         pause_seconds = min(2 * pause_seconds, 0.05)
@@ -116,14 +117,6 @@ def _reaped() -> Iterator[tuple[int, int]]:
             if pid == 0:
                 return
             yield pid, status
-
-
-def _has_children() -> bool:
-    try:
-        os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT)
-    except ChildProcessError:
-        return False
-    return True
 
 
 def _end_as(status: int) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, dry_run_options, typed_command
 from vla_eval.cli.shared.cluster import backend_of
+from vla_eval.cli.shared.output import say
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.model_table import (
     EVALUATION_FOLDER,
@@ -92,7 +93,7 @@ def evaluate_table(args: argparse.Namespace) -> int:
         return 0
     with backend_of(args, needs=lambda: needed_files(study)) as backend:
         if args.tiny:
-            _say(
+            say(
                 f"{study.table.name}: tiny random models on a stand-in for the simulator. The figures mean "
                 "nothing."
             )
@@ -155,7 +156,7 @@ def _finetune(study: Study, backend: Backend, *, device: str, allow_unreplayed: 
             backend,
             device=device,
             allow_unreplayed=allow_unreplayed,
-            say=_say,
+            say=say,
             is_stopping=lambda: stop.is_asked,
         )
     return None if is_finished else stop.exit_code
@@ -178,7 +179,3 @@ def _refuse(args: argparse.Namespace, flags: Sequence[str]) -> None:
             f"{', '.join(given)}: a table of learned policies sets this itself. Copy {args.config} to "
             "./configs/ and change it there."
         )
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -112,6 +112,11 @@ def hint_merge(whole: Path, shard: Shard) -> None:
     )
 
 
+def say(line: str) -> None:
+    """Print a line for a person to standard error, at once."""
+    print(line, file=sys.stderr, flush=True)
+
+
 def hint_next(*words: object) -> None:
     """Say on standard error which command comes next."""
     print(f"Next: {shlex.join(['mikasa-vla', *map(str, words)])}", file=sys.stderr)

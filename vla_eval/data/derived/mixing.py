@@ -38,7 +38,11 @@ def mix_datasets(roots: Sequence[Path], out: Path) -> MixtureFacts:
     sources = tuple(_source(one) for one in opened)
     _refuse_repetition(sources)
     with whole_folder(out, error=DatasetError) as draft:
-        _aggregate([one.root for one in opened], draft)
+        try:
+            join_datasets(roots, draft, concatenate_videos=False, concatenate_data=False)
+        except ValueError as exc:
+            named = ", ".join(map(str, roots))
+            raise DatasetError(f"lerobot cannot put {named} together: {exc!s:.300}") from exc
         write_statistics(draft, [one.meta for one in opened])
         facts = MixtureFacts(
             complete=True,
@@ -115,15 +119,6 @@ def _refuse_repetition(sources: Sequence[MixtureSource]) -> None:
                 "count twice. Name it once."
             )
         by_content[source.sha256] = source.name
-
-
-def _aggregate(roots: Sequence[Path], draft: Path) -> None:
-    try:
-        join_datasets(roots, draft, concatenate_videos=False, concatenate_data=False)
-    except ValueError as exc:
-        raise DatasetError(
-            f"lerobot cannot put {', '.join(str(root) for root in roots)} together: {exc!s:.300}"
-        ) from exc
 
 
 def write_statistics(root: Path, metas: Sequence[Any]) -> None:

@@ -27,7 +27,7 @@ from vla_eval.data.recording.jobs import (
     join_job,
     shard_jobs,
 )
-from vla_eval.data.recording.plan import RecordingPlan, plan_recording
+from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.recording.seed_queue import SeedQueue, Selection
 from vla_eval.errors import RecordingError
 from vla_eval.storage.provenance import collect_environment
@@ -184,7 +184,6 @@ def record(
         pool: RecordingPool = backend.pool(spec, size=n_workers)
         with pool as running:
             recorder = _Recorder(
-                plan=plan,
                 folder=folder,
                 pool=running,
                 observer=observer or _Silence(),
@@ -204,7 +203,6 @@ def record(
 
 @dataclass(slots=True, kw_only=True)
 class _Recorder:
-    plan: RecordingPlan
     folder: RecordingFolder
     pool: RecordingPool
     observer: RecordingObserver
