@@ -108,7 +108,7 @@ def run(ray: StandIn, jobs: Sequence[Job], monkeypatch: pytest.MonkeyPatch) -> l
     spec = WorkerSpec(
         runner=RunnerClass(target="builtins:print"), answers=(), timeouts=TimeoutConfig(), logs=Path.cwd()
     )
-    pool: ClusterPool[Job, Any] = ClusterPool(ray, OneMachine(), spec, place, size=2)  # type: ignore[arg-type]
+    pool: ClusterPool[Job, Any] = ClusterPool(ray, OneMachine(), spec, place, size=2, takes_gpu=False)  # type: ignore[arg-type]
     with pool as running:
         return [event for event in running.run(JobList(jobs)) if isinstance(event, Answered)]
 

@@ -149,9 +149,6 @@ def _row(
     )
 
 
-# ------------------------------------------------------------------------------------------ commands
-
-
 class _Ran(NamedTuple):
     """When a command wrote each record, when it ended, and the CPU time of all its processes; s."""
 

@@ -96,9 +96,6 @@ def make_in_process(policy: str, *, n_rows: int, **args: Any) -> Policy:
     return make_from_adapter(recipe.value.adapter, context(recipe.name, n_rows=n_rows), made)
 
 
-# ------------------------------------------------------------------------------------------ a server
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Server:
     """A policy server in a process of its own."""
@@ -142,9 +139,6 @@ def serving(policy: str, *, n_rows: int, compiles: bool = False) -> Iterator[Ser
                 process.wait()
             if process.stdout is not None:
                 process.stdout.close()
-
-
-# ------------------------------------------------------------------------------------------ copies
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

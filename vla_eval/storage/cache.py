@@ -23,7 +23,7 @@ def cached(name: str) -> Path:
     wanted = cache_dir() / name
     if wanted.exists() or (reason := _why_not(wanted.parent)) is None:
         return wanted
-    return _instead_of(cache_dir(), reason) / name
+    return Path(_instead_of(cache_dir(), reason).name) / name
 
 
 def _why_not(folder: Path) -> str | None:
@@ -37,16 +37,12 @@ def _why_not(folder: Path) -> str | None:
     return None if os.access(folder, os.W_OK | os.X_OK) else "no permission to write"
 
 
-@functools.cache
-def _instead_of(folder: Path, reason: str) -> Path:
+@functools.cache  # which keeps it: its folder is removed when Python ends
+def _instead_of(folder: Path, reason: str) -> "tempfile.TemporaryDirectory[str]":
     temporary = tempfile.TemporaryDirectory(prefix="mikasa-vla-cache-", ignore_cleanup_errors=True)
-    _KEPT.append(temporary)
     logger.warning(
         "%s: the cache cannot be written (%s). What is made is lost at the end of this process; let %s name "
         "another folder.",
         *(folder, reason, VARIABLE),
     )
-    return Path(temporary.name)
-
-
-_KEPT: list["tempfile.TemporaryDirectory[str]"] = []  # each removes its folder when Python ends
+    return temporary

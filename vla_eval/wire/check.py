@@ -58,9 +58,6 @@ def check_remote(
     return met
 
 
-# ------------------------------------------------------------------------------------------ the checks
-
-
 def _plain(server: Server) -> list[str]:
     return [
         "The server sends a map as its first message.",

@@ -49,9 +49,6 @@ class CodecError(ValueError):
     """A message cannot be written or read."""
 
 
-# ------------------------------------------------------------------------------------------ write
-
-
 def packb(message: Any, text_markers: bool = False) -> bytes:
     """Return a message of maps, lists, text, bytes, numbers, None, numpy arrays and scalars as bytes.
 
@@ -101,9 +98,6 @@ def _marked(value: Any, text_markers: bool) -> Any:
     else:
         fields = {SCALAR: True, "data": value.item(), "dtype": value.dtype.str}
     return fields if text_markers else {key.encode(): item for key, item in fields.items()}
-
-
-# ------------------------------------------------------------------------------------------ read
 
 
 def unpackb(data: Any) -> Any:

@@ -146,12 +146,9 @@ def _read(value: object, name: str, reader: "_Reader", *, where: str) -> Any:
     return read
 
 
-# ---------------------------------------------------------------- readers: None for what does not fit
-
-
 class _Reader(NamedTuple):
     expected: str
-    read: Callable[[Any], Any]
+    read: Callable[[Any], Any]  # returns None for what does not fit
 
 
 def _text(value: Any) -> str | None:

@@ -68,9 +68,6 @@ def require_sound(demonstrations: Demonstrations, *, rules: Sequence[Rule] | Non
     return tuple(str(one) for one in found)
 
 
-# -------------------------------------------------------------------------------------------- checks
-
-
 def _frame_rate(what: Demonstrations) -> Iterator[str]:
     if what.fps != FPS:
         yield f"It has {what.fps:g} frames per second, expected {FPS}: one per control step."

@@ -59,14 +59,7 @@ class ClusterPool[J: Job, A]:
     """Some actors with a worker process, and a GPU (`takes_gpu`), each; a context manager that ends all."""
 
     def __init__(
-        self,
-        ray: Any,
-        machines: Machines,
-        spec: WorkerSpec,
-        place: Place,
-        *,
-        size: int,
-        takes_gpu: bool = False,
+        self, ray: Any, machines: Machines, spec: WorkerSpec, place: Place, *, size: int, takes_gpu: bool
     ) -> None:
         self._ray, self._machines, self._spec, self._place = ray, machines, spec, place
         self._size, self._takes_gpu = size, takes_gpu

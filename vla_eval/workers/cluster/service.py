@@ -3,7 +3,7 @@
 import contextlib
 import time
 from pathlib import Path
-from typing import Any, NamedTuple  # Ray is optional: not looked at by mypy
+from typing import Any  # Ray is optional: not looked at by mypy
 
 from vla_eval.workers.cluster.actor import Place, ServiceActor
 from vla_eval.workers.cluster.connect import on_machine
@@ -12,13 +12,6 @@ from vla_eval.workers.process import CLOSE_SECONDS, END_SECONDS, WorkerMain
 
 KILLED = -9
 SHARE_SECONDS = 5.0  # between two questions for the time in forward passes
-
-
-class _Busy(NamedTuple):
-    """At a time of `time.monotonic`, how long a server had been in forward passes."""
-
-    at: float
-    seconds: float
 
 
 class ClusterService:
@@ -53,7 +46,8 @@ class ClusterService:
         self._actor = actor.remote(main, preload, place, index, machine.address)
         self._reading: Any = None
         self._asked: tuple[float, Any] | None = None  # when, and the call
-        self._busy = _Busy(time.monotonic(), 0.0)
+        # When it was asked last, and how long it had been in forward passes by then.
+        self._busy_at, self._busy_seconds = time.monotonic(), 0.0
         self._share: float | None = None
         machine.services.append(self)
 
@@ -80,7 +74,7 @@ class ClusterService:
     def busy_share(self) -> float | None:
         """Return its share of time in forward passes of late; never waits for an answer."""
         now = time.monotonic()
-        if self._asked is None and now - self._busy.at >= SHARE_SECONDS:
+        if self._asked is None and now - self._busy_at >= SHARE_SECONDS:
             self._asked = now, self._actor.busy_seconds.remote()
         if self._asked is not None:
             at, call = self._asked
@@ -89,8 +83,8 @@ class ClusterService:
                 self._asked = None
                 with contextlib.suppress(self._ray.exceptions.RayError):  # it has died, which others notice
                     seconds: float = self._ray.get(call)
-                    self._share = min(1.0, (seconds - self._busy.seconds) / (at - self._busy.at))
-                    self._busy = _Busy(at, seconds)
+                    self._share = min(1.0, (seconds - self._busy_seconds) / (at - self._busy_at))
+                    self._busy_at, self._busy_seconds = at, seconds
         return self._share
 
     def wait(self, seconds: float) -> int | None:
