@@ -113,19 +113,12 @@ class SimEnv(Protocol):
         """Cameras, states, action and horizon, as they are for every slot."""
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
-        """Begin an episode in each of the given slots.
-
-        Args:
-            seeds: slot -> seed.
-            render: whether the reset observations hold images.
-        """
+        """Begin an episode in each of the slots (slot -> seed); with images in its observation if `render`."""
 
     def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
-        """Execute one control step in each of the given slots.
+        """Execute one control step in each of the slots (slot -> (A,) float32).
 
-        Args:
-            actions: slot -> (A,) float32.
-            render: the slots whose new observation must hold images.
+        `render`: the slots whose new observation must hold images.
         """
 
     def hold_action(self, slot: int) -> FloatArray:

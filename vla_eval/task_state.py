@@ -23,11 +23,7 @@ class TaskStatus:
     phase: Phase | None  # the phase at this step; None where the environment does not show it
     success: bool  # the success rule holds at this very step
     fail: bool = False  # the episode is lost for good (`strict_choice`, first wrong candidate)
-    # index of the right candidate; None for a task without candidates or with several right ones
-    target: int | None = None
     n_candidates: int = 0  # how many candidates there are; 0 for a task without candidates
-    # index of the candidate that was touched first in the response phase, if any
-    first_choice: int | None = None
     # how many different wrong candidates have been touched in the response phase
     n_wrong_choices: int = 0
     # the candidates that it is right to touch first; empty without candidates
@@ -40,10 +36,20 @@ class TaskStatus:
     candidate_places: tuple[int, ...] = ()
     # the right candidates, in the order shown; None where it is not said
     right_candidates: tuple[int, ...] | None = None
-    # those touched so far, in the order of first touch; None where it is not said
+    # those touched so far in the response phase, in the order of first touch; None where it is not said
     touched_candidates: tuple[int, ...] | None = None
     # how far the object of the task is turned from its first orientation; None without one
     turned_rad: float | None = None
+
+    @property
+    def target(self) -> int | None:
+        """The right candidate; None for a task without candidates or with several right ones."""
+        return _only_one(self.right_candidates)
+
+    @property
+    def first_choice(self) -> int | None:
+        """The candidate that was touched first, if any."""
+        return self.touched_candidates[0] if self.touched_candidates else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,8 +64,6 @@ class PrivilegedState:
     # (N, 3) where each candidate is (or, before the response phase, will be), world frame, in candidate
     # order; (0, 3) for a task without candidates
     candidate_positions_m: NDArray[np.float64]
-    # index of the right candidate; None for a task without candidates or with several right ones
-    target: int | None
     # indices of all right candidates, in the order shown; empty without candidates
     right_candidates: tuple[int, ...] = ()
     shown_candidates: tuple[int, ...] = ()  # those of them whose cue is in view at this step
@@ -71,6 +75,11 @@ class PrivilegedState:
     # how far the gripper is turned about world z; 0 with the fingers in a row along y
     tcp_yaw_rad: float = 0.0
 
+    @property
+    def target(self) -> int | None:
+        """The right candidate; None for a task without candidates or with several right ones."""
+        return _only_one(self.right_candidates)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BodyState:
@@ -81,6 +90,5 @@ class BodyState:
     yaw_rad: float = 0.0
 
 
-def only_one(right_candidates: tuple[int, ...]) -> int | None:
-    """Return the right candidate if there is only one."""
-    return right_candidates[0] if len(right_candidates) == 1 else None
+def _only_one(candidates: tuple[int, ...] | None) -> int | None:
+    return candidates[0] if candidates is not None and len(candidates) == 1 else None

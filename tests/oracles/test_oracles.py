@@ -22,7 +22,6 @@ def still(**bodies: BodyState) -> PrivilegedState:
         tcp_velocity_m_s=ZERO,
         gripper_width_m=0.08,
         candidate_positions_m=np.zeros((0, 3)),
-        target=None,
         bodies=bodies,
     )
 

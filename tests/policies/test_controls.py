@@ -176,7 +176,7 @@ def test_a_blind_arm_does_not_know_the_target() -> None:
 
 def _window_with_target(result: StepResult, target: int) -> Any:
     assert result.observation.privileged is not None
-    privileged = replace(result.observation.privileged, target=target)
+    privileged = replace(result.observation.privileged, right_candidates=(target,))
     return ObservationWindow(slot=0, frames=(replace(result.observation, privileged=privileged),))
 
 

@@ -20,7 +20,7 @@ from vla_eval.envs.official_settings import check_official
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.specs import EnvSpec
-from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus, only_one
+from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
 from vla_eval.tasks.arguments import check_argument, check_arguments
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.catalog import task_spec
@@ -243,7 +243,6 @@ class FakeEnv:
             phase=self._phase(episode),
             success=success and not is_lost,
             fail=is_lost,
-            target=only_one(episode.targets),
             right_first_choices=episode.targets[:1] if self._in_order else episode.targets,
             chance_success=chance_of_several(self._n_items, self._n_shown, in_order=self._in_order)
             if self._n_items
@@ -252,7 +251,6 @@ class FakeEnv:
             right_candidates=episode.targets,
             touched_candidates=tuple(episode.touched),
             n_candidates=self._n_items,
-            first_choice=episode.touched[0] if episode.touched else None,
             n_wrong_choices=n_wrong,
         )
         return StepResult(
@@ -308,7 +306,6 @@ class FakeEnv:
             tcp_velocity_m_s=episode.tcp_velocity_m_s.copy(),
             gripper_width_m=episode.gripper_width_m,
             candidate_positions_m=episode.candidates_m.copy(),
-            target=only_one(episode.targets),
             right_candidates=episode.targets,
             shown_candidates=episode.targets if self._is_in_view(episode) else (),
             in_order=self._in_order,

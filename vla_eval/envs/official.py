@@ -234,9 +234,7 @@ class OfficialEpisode:
         target, chosen = self.candidates.target, tuple(self._choices.chosen)
         return replace(
             said,
-            target=target,
             n_candidates=len(self.candidates.positions_m),
-            first_choice=chosen[0] if chosen else None,
             n_wrong_choices=len(set(chosen) - {target}),
             right_first_choices=(target,),
             chance_success=1 / len(self.candidates.positions_m),
@@ -261,7 +259,6 @@ class OfficialEpisode:
             tcp_velocity_m_s=to_vector(tcp.linear_velocity[0]),
             gripper_width_m=float(env.agent.robot.get_qpos()[0, -2:].sum()),
             candidate_positions_m=np.zeros((0, 3)) if candidates is None else candidates.positions_m,
-            target=None if candidates is None else candidates.target,
             right_candidates=right,
             shown_candidates=right if is_shown else (),
             touched_candidates=tuple(self._choices.chosen),

@@ -12,7 +12,7 @@ from mani_skill.utils.structs import Actor
 from numpy.typing import NDArray
 
 from vla_eval.core import FloatArray
-from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus, only_one
+from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
 from vla_eval.tasks.memory_env import MemoryTableEnv, Wxyz, nearness, poses
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import (
@@ -201,14 +201,12 @@ class ChoiceEnv(MemoryTableEnv):
 
     def status(self, info: Info, env: int) -> TaskStatus:
         """Return the status, with what was chosen and what is right."""
-        first, right = int(info["first_choice"][env]), self.right_candidates(env)
+        right = self.right_candidates(env)
         return TaskStatus(
             phase=PHASES[int(info["phase"][env])],
             success=bool(info["success"][env]),
             fail=bool(info["fail"][env]),
-            target=only_one(right),
             n_candidates=len(self.candidates),
-            first_choice=None if first == NO_CHOICE else first,
             n_wrong_choices=int(info["n_wrong_choices"][env]),
             right_first_choices=right[:1] if self.in_order else right,
             chance_success=self.chance_success(),
@@ -219,12 +217,10 @@ class ChoiceEnv(MemoryTableEnv):
 
     def true_state(self, info: Info, env: int) -> PrivilegedState:
         """Return the true state, with the candidates and which are right."""
-        right = self.right_candidates(env)
         return replace(
             super().true_state(info, env),
             candidate_positions_m=self.final_positions_m()[env].astype(np.float64),
-            target=only_one(right),
-            right_candidates=right,
+            right_candidates=self.right_candidates(env),
             shown_candidates=self.shown_candidates(env),
             in_order=self.in_order,
             touched_candidates=self.touched_candidates(env),

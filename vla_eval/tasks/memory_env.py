@@ -338,7 +338,6 @@ class MemoryTableEnv(TensorsOut):
             tcp_velocity_m_s=velocity_of(self.agent.tcp)[env].astype(np.float64),
             gripper_width_m=float(self.gripper_width_m()[env]),
             candidate_positions_m=np.zeros((0, 3)),
-            target=None,
             bodies={name: body.state(env) for name, body in self.moving_bodies().items()},
             tcp_yaw_rad=float(self.tcp_yaw_rad()[env]),
         )
