@@ -113,7 +113,7 @@ class SimEnv(Protocol):
         """Cameras, states, action and horizon, as they are for every slot."""
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
-        """Begin an episode in each of the slots (slot -> seed); with images in its observation if `render`."""
+        """Begin an episode in each of the slots (slot -> seed); `render`: with images in its observation."""
 
     def step(self, actions: Mapping[int, FloatArray], *, render: frozenset[int]) -> dict[int, StepResult]:
         """Execute one control step in each of the slots (slot -> (A,) float32).

@@ -1,22 +1,20 @@
 """Make an environment from its settings: alone knows which simulators exist, imports them on first use."""
 
 import importlib
-from collections.abc import Callable
-from typing import cast
+from typing import cast, get_args
 
-from vla_eval.config.environment import EnvSettings
+from vla_eval.config.environment import EnvSettings, Simulator
 from vla_eval.core import SimEnv
 from vla_eval.envs.fake import FakeEnv
 from vla_eval.envs.official_settings import check_official
-from vla_eval.errors import MissingDependencyError, unknown_name
+from vla_eval.errors import MissingDependencyError, check_names
 from vla_eval.lock.switch import own_need
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import check_arguments, offered_by, robot_uid
 from vla_eval.tasks.catalog import task_spec
 
-SIMULATORS = {"maniskill": "vla_eval.envs.maniskill:ManiSkillEnv", "fake": "vla_eval.envs.fake:FakeEnv"}
-OFFICIAL = "vla_eval.envs.official:OfficialEnv"
-"""In place of `maniskill` for the tasks of the official package, which are its own ManiSkill environments."""
+OURS, OFFICIAL = "vla_eval.envs.maniskill:ManiSkillEnv", "vla_eval.envs.official:OfficialEnv"
+"""What runs our tasks on ManiSkill; those of the official package are its own ManiSkill environments."""
 
 
 def make_env(settings: EnvSettings) -> SimEnv:
@@ -27,12 +25,11 @@ def make_env(settings: EnvSettings) -> SimEnv:
         TaskArgumentError: the task does not take these arguments.
         RenderingError: cameras are wanted and no renderer can be started.
     """
-    if settings.simulator not in SIMULATORS:
-        raise unknown_name("simulator", settings.simulator, SIMULATORS)
-    factory_name = SIMULATORS[settings.simulator]
-    if settings.simulator == "maniskill" and task_spec(settings.task).is_official:
-        factory_name = OFFICIAL
-    module_name, _, attribute = factory_name.partition(":")
+    check_names("simulator", [settings.simulator], get_args(Simulator))
+    if settings.simulator == "fake":
+        return FakeEnv(settings)
+    place = OFFICIAL if task_spec(settings.task).is_official else OURS
+    module_name, _, attribute = place.partition(":")
     try:
         with own_need():  # SAPIEN runs a program when it is imported
             module = importlib.import_module(module_name)
@@ -43,8 +40,7 @@ def make_env(settings: EnvSettings) -> SimEnv:
             f"simulator '{settings.simulator}' needs the package '{exc.name}', which is not installed. "
             f"Run `make setup`, or install mikasa-vla-eval again; `mikasa-vla doctor` checks the machine."
         ) from exc
-    factory = cast("Callable[[EnvSettings], SimEnv]", getattr(module, attribute))
-    return factory(settings)
+    return cast("SimEnv", getattr(module, attribute)(settings))
 
 
 def describe_env(settings: EnvSettings) -> EnvSpec:

@@ -13,7 +13,6 @@ from vla_eval.config.environment import WristMesh
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
 from vla_eval.features import JOINT_NAMES
 
-FINGERS = ("finger1", "finger2")
 FETCH_UID = "fetch_at_table"
 WRIST_MESH_ROBOTS: dict[WristMesh, str] = {
     "shipped": "panda_wristcam_seen",
@@ -49,7 +48,7 @@ FETCH = Arm(
     joints=(
         *("root_x", "root_y", "root_turn", "torso", "head_pan", "shoulder_pan", "head_tilt"),
         *("shoulder_lift", "upperarm_roll", "elbow", "forearm_roll", "wrist", "wrist_roll"),
-        *FINGERS,
+        *("finger1", "finger2"),
     ),
     arm_joints=(5, 7, 8, 9, 10, 11, 12),
     rest_qpos=(0.0, 0.0, 0.0, 0.386, 0.0, 0.0, 0.0, -1.0106, 0.0, 1.3855, 0.0, 0.1487, 0.0, 0.05, 0.05),
