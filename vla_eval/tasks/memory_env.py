@@ -153,8 +153,6 @@ class MemoryTableEnv(TensorsOut):
         """Return how many other cues the same scene could have; `swap_cue` selects one of them."""
         raise NotImplementedError
 
-    # ---------------------------------------------------------------- scene
-
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
         pose = _look_at((0.3, 0, 0.6), (-0.1, 0, 0.1))
@@ -200,8 +198,6 @@ class MemoryTableEnv(TensorsOut):
         index = self._park_index.setdefault(name, len(self._park_index))
         return sapien.Pose(p=[PARK_X_M + PARK_SPACING_M * index, 0, FLOOR_Z_M + half_height_m])
 
-    # ---------------------------------------------------------------- episode
-
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         arm = self.arm
         qpos = np.tile(np.array(arm.rest_qpos), (len(env_idx), 1))
@@ -241,8 +237,6 @@ class MemoryTableEnv(TensorsOut):
         the successes of a blind arm would be correlated between tasks.
         """
         return (self.FAMILY,)
-
-    # ---------------------------------------------------------------- phases
 
     def total_cue_steps(self, cue_steps: int) -> int:
         """Return the length of the cue phase; it is longer if a task shows several objects in turn."""
@@ -301,8 +295,6 @@ class MemoryTableEnv(TensorsOut):
                 for set_velocity in (actor.set_linear_velocity, actor.set_angular_velocity):
                     set_velocity(torch.zeros(3, device=self.device))
 
-    # ---------------------------------------------------------------- reading
-
     def response_begun(self) -> Flags:
         """Return (B,) bool: the response phase has begun."""
         return self.step_count() >= self._response_step
@@ -350,8 +342,6 @@ class MemoryTableEnv(TensorsOut):
         """Return the info of the present step, (B, …) arrays by name; every array in it is a new one."""
         steps = self.step_count()
         return {"elapsed_steps": steps.copy(), **self.evaluate(), "phase": self.phase_index(steps)}
-
-    # ---------------------------------------------------------------- reward
 
     def normalized_reward(self, info: Info) -> FloatArray:
         """Return the (B,) dense reward of the present step, divided by its value at success."""

@@ -139,8 +139,6 @@ class SeveralColorsEnv(ItemChoiceEnv):
         """Return the success rate of a perfect arm that knows how many cubes were shown, not which."""
         return chance_of_several(self.n_items, self.n_shown, in_order=self.in_order)
 
-    # ---------------------------------------------------------------- episode
-
     def _load_scene(self, options: dict[str, Any]) -> None:
         super()._load_scene(options)
         self._sequence: Indices = np.zeros((self.num_envs, self.n_shown), dtype=np.int64)
@@ -245,8 +243,6 @@ class SeveralColorsEnv(ItemChoiceEnv):
         turn_steps = int(self._turn_steps()[env])
         turn, since = divmod(int(self.step_count()[env]) - self.cue_after_steps, turn_steps)
         return (int(self._seen_sequence[env, turn]),) if since < turn_steps - self.gap_steps else ()
-
-    # ---------------------------------------------------------------- touches
 
     def right_candidates(self, env: int) -> tuple[int, ...]:
         """Return the cubes that were shown, in the order shown."""

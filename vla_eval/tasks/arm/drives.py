@@ -183,9 +183,6 @@ DRIVES: dict[type, Callable[[Any], Drive]] = {
 """ManiSkill's class -> what makes its drive. An arm with other controllers keeps theirs."""
 
 
-# ---------------------------------------------------------------- rotations, as ManiSkill computes them
-
-
 def _product(a: Quaternion, b: Quaternion) -> Quaternion:
     aw, ax, ay, az = a
     bw, bx, by, bz = b
