@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from tests.models.golden_values import GoldenValues
-from vla_eval.models.shared.prompts import Prompts
+from vla_eval.models.shared.greedy import Prompts
 
 
 @functools.cache

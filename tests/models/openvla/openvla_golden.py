@@ -15,7 +15,7 @@ from vla_eval.models.openvla.network import OpenVLANetwork
 from vla_eval.models.openvla.sizes import N_BINS, NetworkOptions, NetworkSizes
 from vla_eval.models.openvla.vision import DINO_MLP_RATIO
 from vla_eval.models.openvla.weight_names import to_ours
-from vla_eval.models.shared.prompts import Prompts
+from vla_eval.models.shared.greedy import Prompts
 from vla_eval.models.weights.exact import put_weights
 
 FOLDER = Path(__file__).parents[2] / "golden" / "openvla_oft"

@@ -13,7 +13,8 @@ from vla_eval.errors import (
     RecipeError,
     SpecMismatchError,
 )
-from vla_eval.models.openvla.prompt import finished, prompt_text
+from vla_eval.models.openvla.network import finished
+from vla_eval.models.openvla.processor_openvla import prompt_text
 from vla_eval.models.openvla.sizes import NetworkSizes
 from vla_eval.models.shared.language_processors import byte_tokenizer
 from vla_eval.models.shared.network_sizes import with_changes

@@ -18,7 +18,7 @@ from vla_eval.models.openvla.generation import (
 )
 from vla_eval.models.openvla.network import Inputs, OpenVLANetwork
 from vla_eval.models.openvla.sizes import NetworkOptions
-from vla_eval.models.shared.prompts import Prompts
+from vla_eval.models.shared.greedy import Prompts
 
 TEXT = golden.SIZES.text_vocabulary
 SMALL = dataclasses.replace(

@@ -12,7 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from tests.models import golden_folder
-from vla_eval.models.shared.prompts import Prompts
+from vla_eval.models.shared.greedy import Prompts
 from vla_eval.models.spatialvla.action_grid import AXES, ActionGrid, Gaussian, gaussian_grid
 from vla_eval.models.spatialvla.conversion import to_ours
 from vla_eval.models.spatialvla.depth import zoe_config, zoe_depth

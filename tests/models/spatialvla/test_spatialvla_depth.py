@@ -10,8 +10,8 @@ from PIL import Image
 from torch import Tensor, nn
 
 from tests.models.spatialvla.spatialvla_golden import DEPTH, SMALL
+from vla_eval.models.shared.greedy import Prompts
 from vla_eval.models.shared.precision import default_dtype
-from vla_eval.models.shared.prompts import Prompts
 from vla_eval.models.spatialvla.depth import PAD_PX, DepthModel, cut_depth, shown_images
 from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
 from vla_eval.models.spatialvla.sizes import NetworkSizes

@@ -24,7 +24,8 @@ from vla_eval.models.spatialvla.action_grid import refitted, uniform_grid
 from vla_eval.models.spatialvla.configuration_spatialvla import LinearDecaySchedulerConfig
 from vla_eval.models.spatialvla.generation import to_tokens
 from vla_eval.models.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
-from vla_eval.models.spatialvla.prompt import finished, prompt_text
+from vla_eval.models.spatialvla.network import finished
+from vla_eval.models.spatialvla.processor_spatialvla import prompt_text
 from vla_eval.models.weights.trainable import check_lora, trainable
 from vla_eval.training.dataset import training_dataset
 

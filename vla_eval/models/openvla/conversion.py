@@ -18,8 +18,7 @@ from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.features import ACTION_KEY, STATE_KEY
 from vla_eval.models.openvla.configuration_openvla import AUGMENTATION, MikasaOpenVLAConfig
 from vla_eval.models.openvla.conversion_options import OpenVLAOptions
-from vla_eval.models.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
-from vla_eval.models.openvla.prompt import prompt_text
+from vla_eval.models.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors, prompt_text
 from vla_eval.models.openvla.sizes import NetworkSizes
 from vla_eval.models.openvla.weight_names import to_ours
 from vla_eval.models.shared.normalization import Normalization

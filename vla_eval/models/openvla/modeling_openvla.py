@@ -14,8 +14,7 @@ from vla_eval.models.openvla.configuration_openvla import (
     MikasaOpenVLAConfig,
 )
 from vla_eval.models.openvla.generation import generated_actions, parallel_actions, token_loss
-from vla_eval.models.openvla.network import Inputs, OpenVLANetwork
-from vla_eval.models.openvla.prompt import finished
+from vla_eval.models.openvla.network import Inputs, OpenVLANetwork, finished
 from vla_eval.models.shared.chunks import PromptedChunks
 from vla_eval.models.shared.images import Size, augment, centre_crop, resize_lanczos3, truncated_levels
 from vla_eval.models.shared.levels import MAX_LEVEL

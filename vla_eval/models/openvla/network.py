@@ -19,11 +19,11 @@ import torch
 from torch import Tensor, nn
 from transformers import DynamicCache, LlamaConfig, LlamaForCausalLM
 
+from vla_eval.errors import SpecMismatchError
 from vla_eval.models.openvla.heads import L1Head, ProprioProjector
 from vla_eval.models.openvla.sizes import NetworkOptions, NetworkSizes
 from vla_eval.models.openvla.vision import FusedVision, Projector
-from vla_eval.models.shared.greedy import places_from
-from vla_eval.models.shared.prompts import Prompts
+from vla_eval.models.shared.greedy import Prompts, places_from
 
 RMS_NORM_EPS = 1e-6  # of OpenVLA; Llama-2's own is 1e-5
 ROPE_THETA = 10_000.0
@@ -135,6 +135,27 @@ class OpenVLANetwork(nn.Module):
         if action_ids is not None:
             ids = ids.masked_scatter(is_action, action_ids)
         return ids, is_action, places <= lengths + n_tokens
+
+
+def finished(ids: Tensor, mask: Tensor, sizes: NetworkSizes) -> Prompts:
+    """Return tokenised prompts (B, T), padded on the right, with the empty token at each one's end.
+
+    Source: the same file, #L960-L985, and prismatic/vla/datasets/datasets.py#L44-L60 at that commit.
+    """
+    if not bool((ids[:, 0] == sizes.bos_token).all()):
+        raise SpecMismatchError(
+            f"OpenVLA's prompts begin with the token {sizes.bos_token}, found {ids[:, 0].tolist()}. The "
+            f"tokenizer is not the model's, or adds no special tokens."
+        )
+    lengths = mask.sum(dim=1)
+    last = ids.gather(1, (lengths - 1)[:, None])[:, 0]
+    is_missing = last != sizes.empty_token
+    wider = torch.cat([ids, torch.full_like(ids[:, :1], sizes.pad_token)], dim=1)
+    places = torch.arange(wider.shape[1], device=ids.device)
+    ends = (places == lengths[:, None]) & is_missing[:, None]
+    return Prompts(
+        ids=torch.where(ends, sizes.empty_token, wider), mask=places < (lengths + is_missing)[:, None]
+    )
 
 
 def _llama_config(sizes: NetworkSizes) -> Any:

@@ -1,6 +1,5 @@
 """Which earlier frames are shown beside the newest one: one rule for training and rollouts."""
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -13,6 +12,9 @@ from vla_eval.models.shared.levels import MAX_LEVEL
 
 BLOCKS = (8, 16, 32)  # per side of an image; of 128 px: 16, 8 and 4 px
 NEAR, FAR = 2, 5  # blocks: what changes between these distances from a block is its surroundings
+RULES = ("last", "keyframes")
+"""`last`: every `stride`-th frame before the newest. `keyframes`: the last frame before each of the greatest
+changes of the scene, so what was in view and is no longer."""
 BURST_FRAMES = 4  # changes in so many frames are one event: cups come down, a cube is replaced
 
 Values = NDArray[np.float64]
@@ -58,29 +60,35 @@ class FrameChoice:
     @property
     def looks(self) -> bool:
         """Whether the rule looks at images."""
-        return RULES[self.rule].looks
+        return self.rule == "keyframes"
 
     def after(self, seen: Seen, image: ImageArray | None) -> Seen:
         """Return what is kept after one more frame (3, H, W) uint8; None: the rule does not look at it."""
-        return RULES[self.rule].after(self, seen, image)
+        if not self.looks:
+            return replace(seen, n_frames=seen.n_frames + 1)
+        if image is None:
+            raise ValueError("the rule 'keyframes' chooses from images, found none")
+        blocks = blocks_of(image)
+        changed = 0.0 if seen.blocks is None else novelty(seen.blocks, blocks)
+        events = seen.events
+        if changed >= self.least_novelty:
+            events = _with_event(events, Event(seen.n_frames - 1, changed), self.n_places)
+        return Seen(n_frames=seen.n_frames + 1, blocks=blocks, events=events)
 
     def shown(self, seen: Seen) -> tuple[int | None, ...]:
         """Return the frame shown at each place: the nearest first by `last`, the oldest by `keyframes`."""
-        numbers = RULES[self.rule].shown(self, seen)
+        if self.looks:
+            numbers = [event.number for event in seen.events]
+        else:
+            numbers = list(range(seen.n_frames - 1 - self.stride, -1, -self.stride))[: self.n_places]
         return (*numbers, *[None] * (self.n_places - len(numbers)))
 
     def wanted(self, seen: Seen) -> frozenset[int]:
         """Return the numbers of the frames that are shown, or may be after further frames."""
-        return RULES[self.rule].wanted(self, seen)
-
-
-class Rule(NamedTuple):
-    """What `FrameChoice` asks of a rule; see its methods."""
-
-    looks: bool
-    after: Callable[[FrameChoice, Seen, ImageArray | None], Seen]
-    shown: Callable[[FrameChoice, Seen], tuple[int, ...]]
-    wanted: Callable[[FrameChoice, Seen], frozenset[int]]
+        if self.looks:
+            return frozenset({*(event.number for event in seen.events), seen.n_frames - 1})
+        oldest = seen.n_frames - 1 - self.n_places * self.stride
+        return frozenset(range(max(0, oldest), seen.n_frames))
 
 
 def blocks_of(image: ImageArray) -> Blocks:
@@ -109,32 +117,6 @@ def _alone(changes: Values) -> float:
     return float((changes - windows[..., around].max(axis=-1)).max())
 
 
-def _count(choice: FrameChoice, seen: Seen, image: ImageArray | None) -> Seen:
-    return replace(seen, n_frames=seen.n_frames + 1)
-
-
-def _last(choice: FrameChoice, seen: Seen) -> tuple[int, ...]:
-    newest = seen.n_frames - 1
-    numbers = (newest - place * choice.stride for place in range(1, choice.n_places + 1))
-    return tuple(number for number in numbers if number >= 0)
-
-
-def _recent(choice: FrameChoice, seen: Seen) -> frozenset[int]:
-    oldest = seen.n_frames - 1 - choice.n_places * choice.stride
-    return frozenset(range(max(0, oldest), seen.n_frames))
-
-
-def _note_change(choice: FrameChoice, seen: Seen, image: ImageArray | None) -> Seen:
-    if image is None:
-        raise ValueError("the rule 'keyframes' chooses from images, found none")
-    blocks = blocks_of(image)
-    changed = 0.0 if seen.blocks is None else novelty(seen.blocks, blocks)
-    events = seen.events
-    if changed >= choice.least_novelty:
-        events = _with_event(events, Event(seen.n_frames - 1, changed), choice.n_places)
-    return Seen(n_frames=seen.n_frames + 1, blocks=blocks, events=events)
-
-
 def _with_event(events: tuple[Event, ...], event: Event, n_places: int) -> tuple[Event, ...]:
     """Return the events with one more, or with a burst that grew; of too many, the least one goes."""
     if events and event.number - events[-1].number < BURST_FRAMES:
@@ -146,21 +128,3 @@ def _with_event(events: tuple[Event, ...], event: Event, n_places: int) -> tuple
     least = min(event.novelty for event in events)
     gone = max(place for place, event in enumerate(events) if event.novelty == least)  # of equals, the newest
     return events[:gone] + events[gone + 1 :]
-
-
-def _before_changes(choice: FrameChoice, seen: Seen) -> tuple[int, ...]:
-    return tuple(event.number for event in seen.events)
-
-
-def _before_changes_and_newest(choice: FrameChoice, seen: Seen) -> frozenset[int]:
-    return frozenset({*_before_changes(choice, seen), seen.n_frames - 1})
-
-
-RULES: Mapping[str, Rule] = {
-    "last": Rule(looks=False, after=_count, shown=_last, wanted=_recent),
-    "keyframes": Rule(
-        looks=True, after=_note_change, shown=_before_changes, wanted=_before_changes_and_newest
-    ),
-}
-"""By name. `last`: every `stride`-th frame before the newest. `keyframes`: the last frame before each of the
-greatest changes of the scene, so what was in view and is no longer."""

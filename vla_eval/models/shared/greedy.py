@@ -14,6 +14,13 @@ from torch.nn import functional
 from transformers import DynamicCache
 
 
+class Prompts(NamedTuple):
+    """Prompts of B samples, without actions: ids (B, T), right-padded; the mask is False for padding."""
+
+    ids: Tensor
+    mask: Tensor
+
+
 class Prefix(NamedTuple):
     """Embeddings (B, N, D), right-padded, which (B, N, N) places attend to which, and lengths (B,)."""
 

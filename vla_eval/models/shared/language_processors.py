@@ -23,6 +23,14 @@ BYTE_TOKENIZER = "bytes"
 BYTE_SPECIAL = ("<pad>", "<s>", "</s>")  # tokens 0, 1 and 2: padding, begin and end of a text
 
 
+def instruction_words(instruction: str, *, model: str) -> str:
+    """Return the instruction, which must not be empty, in lower case, as both originals have it."""
+    words = instruction.strip().lower()
+    if not words:
+        raise MissingInstructionError(f"{model} needs an instruction, found an empty one.")
+    return words
+
+
 @dataclass
 class InstructionStep(ComplementaryDataProcessorStep):  # type: ignore[misc]  # lerobot is untyped
     """Puts a policy's words around the instruction; a policy registers its own with a `prompt` method."""

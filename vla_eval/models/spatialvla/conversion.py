@@ -28,8 +28,11 @@ from vla_eval.models.spatialvla.action_grid import AXES
 from vla_eval.models.spatialvla.configuration_spatialvla import MikasaSpatialVLAConfig
 from vla_eval.models.spatialvla.conversion_options import SpatialVLAOptions
 from vla_eval.models.spatialvla.described import GRID_PARTS, PROCESSOR_FILE, check_described
-from vla_eval.models.spatialvla.processor_spatialvla import make_mikasa_spatialvla_pre_post_processors
-from vla_eval.models.spatialvla.prompt import finished, prompt_text
+from vla_eval.models.spatialvla.network import finished
+from vla_eval.models.spatialvla.processor_spatialvla import (
+    make_mikasa_spatialvla_pre_post_processors,
+    prompt_text,
+)
 from vla_eval.models.spatialvla.sizes import Attention, NetworkSizes
 from vla_eval.strict.json_fields import read_json
 

@@ -15,8 +15,7 @@ from vla_eval.models.spatialvla.action_grid import refitted
 from vla_eval.models.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig
 from vla_eval.models.spatialvla.ego3d import intrinsics, resized_intrinsics
 from vla_eval.models.spatialvla.generation import generated_actions, token_loss
-from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork
-from vla_eval.models.spatialvla.prompt import finished
+from vla_eval.models.spatialvla.network import Inputs, SpatialVLANetwork, finished
 
 
 class MikasaSpatialVLAPolicy(PromptedChunks, PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyped

@@ -5,11 +5,15 @@ from typing import Any  # lerobot is untyped
 
 from lerobot.processor import ProcessorStepRegistry
 
-from vla_eval.models.shared.language_processors import InstructionStep, language_processors
+from vla_eval.models.shared.language_processors import InstructionStep, instruction_words, language_processors
 from vla_eval.models.spatialvla.configuration_spatialvla import MikasaSpatialVLAConfig
-from vla_eval.models.spatialvla.prompt import prompt_text
 
 PROMPT_STEP = "mikasa_spatialvla_prompt"
+
+
+def prompt_text(instruction: str) -> str:
+    """Return the prompt of an instruction, as in the golden files."""
+    return f"{instruction_words(instruction, model='SpatialVLA')}\n"
 
 
 @dataclass
