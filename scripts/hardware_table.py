@@ -8,7 +8,7 @@ from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, LoraRecip
 from vla_eval.testing.random_checkpoint import published_sizes
 from vla_eval.training.cost.estimate import estimate, unfilled_model
 from vla_eval.training.job import load_finetune_recipe
-from vla_eval.training.lora import check_lora_targets
+from vla_eval.training.policy_config import check_lora_targets
 
 Change = Mapping[str, Any]
 

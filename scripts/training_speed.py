@@ -21,7 +21,7 @@ from vla_eval.testing.random_checkpoint import built_tiny, stand_in_config, writ
 from vla_eval.training.batches import preprocessed
 from vla_eval.training.cost.estimate import estimate
 from vla_eval.training.loop import autocast_dtype
-from vla_eval.training.lora import peft_config
+from vla_eval.training.policy_config import peft_config
 from vla_eval.training.request import load_finetune_recipe
 
 LEARNING_RATE = 1e-5

@@ -6,7 +6,7 @@ import pytest
 
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.checkpoints.verify import Verified
-from vla_eval.config import shipped
+from vla_eval.config import files
 from vla_eval.errors import CheckpointError
 
 
@@ -14,7 +14,7 @@ from vla_eval.errors import CheckpointError
 def _package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "work").mkdir()
     monkeypatch.chdir(tmp_path / "work")
-    monkeypatch.setattr(shipped, "PACKAGE_ROOT", tmp_path / "package")
+    monkeypatch.setattr(files, "PACKAGE_ROOT", tmp_path / "package")
     write(tmp_path / "package" / "recipes_data" / "checkpoints" / "memory_small")
 
 

@@ -25,7 +25,7 @@ from vla_eval.checkpoints.loading import LoadOptions, read_config
 from vla_eval.cli.main import main
 from vla_eval.data.opening import open_local_dataset
 from vla_eval.errors import CheckpointError, DatasetError, TrainingError
-from vla_eval.models.octo.original import read_parameters
+from vla_eval.models.octo.conversion import read_parameters
 from vla_eval.models.openvla.conversion import read_weights
 from vla_eval.models.openvla.conversion_options import OpenVLAOptions
 from vla_eval.models.openvla.sizes import NetworkSizes

@@ -14,7 +14,7 @@ from vla_eval.config.policy import PolicyRecipe, load_policy
 from vla_eval.errors import UnknownNameError
 from vla_eval.evaluation.model_table import gpu_hours, load_model_table
 from vla_eval.models.octo.configuration_octo import MikasaOctoConfig
-from vla_eval.strict.renamed import warn_renamed
+from vla_eval.strict.decoding import warn_renamed
 from vla_eval.training.request import load_finetune_recipe, run_folder_of
 
 BOTH = ["observation.images.base", "observation.images.wrist"]

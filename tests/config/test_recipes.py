@@ -8,7 +8,7 @@ import pytest
 
 from tests.config.eval_configs import MINIMAL, config
 from tests.evaluation.resolved import make_plan
-from vla_eval.config import shipped
+from vla_eval.config import files
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, digest_of, find_recipe, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
@@ -139,7 +139,7 @@ class TestFinding:
         data = tmp_path / "site" / "vla_eval" / "recipes_data" / "prompts"
         data.mkdir(parents=True)
         (data / "other.yaml").write_text("")
-        monkeypatch.setattr(shipped, "PACKAGE_ROOT", tmp_path / "site" / "vla_eval")
+        monkeypatch.setattr(files, "PACKAGE_ROOT", tmp_path / "site" / "vla_eval")
         monkeypatch.chdir(tmp_path)
 
         assert list_recipes("prompts") == {"other": data / "other.yaml"}

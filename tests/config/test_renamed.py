@@ -13,8 +13,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import RecipeError
-from vla_eval.strict.decoding import decode
-from vla_eval.strict.renamed import formerly, warn_renamed
+from vla_eval.strict.decoding import decode, formerly, warn_renamed
 
 BASE = {"name": "x", "tasks": ["RememberColor3-v0"], "policies": ["oracle"]}
 

@@ -15,7 +15,7 @@ from vla_eval.data.frames import frame_cache
 from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.opening import open_local_dataset, video_decoder
 from vla_eval.errors import DatasetError, StorageFullError, UnknownNameError
-from vla_eval.strict.renamed import warn_renamed
+from vla_eval.strict.decoding import warn_renamed
 from vla_eval.testing.synthetic import write_synthetic_dataset
 
 BASE, WRIST = "observation.images.base", "observation.images.wrist"

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tests.tasks.sample import SAMPLE
-from vla_eval.config.appearance import AppearanceSettings
-from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.config.environment import AppearanceSettings, EnvSettings, RenderSettings
 from vla_eval.core import ImageArray
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.scenes import take_images

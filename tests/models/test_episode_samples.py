@@ -11,7 +11,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.models.episodes.samples import Episodes, count_motions, episodes_of
 from vla_eval.models.sequence.configuration_sequence import MikasaSequenceConfig
-from vla_eval.models.shared.levels import in_numbers
+from vla_eval.models.shared.images import in_numbers
 
 CAMERAS = ("observation.images.base", "observation.images.wrist")
 N_EPISODES, N_STEPS, CHUNK, EDGE_PX, MOST_PX = 6, 5, 8, 16, 3

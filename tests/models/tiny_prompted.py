@@ -11,10 +11,10 @@ from tests.training.fitted_policies import policy_config
 from vla_eval.config.files import load_recipe
 from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.models.openvla import prompt as openvla_prompt
+from vla_eval.models.openvla import processor_openvla
 from vla_eval.models.openvla.modeling_openvla import MikasaOpenVLAPolicy
 from vla_eval.models.openvla.processor_openvla import make_mikasa_openvla_pre_post_processors
-from vla_eval.models.spatialvla import prompt as spatialvla_prompt
+from vla_eval.models.spatialvla import processor_spatialvla
 from vla_eval.models.spatialvla.modeling_spatialvla import MikasaSpatialVLAPolicy
 from vla_eval.models.spatialvla.processor_spatialvla import make_mikasa_spatialvla_pre_post_processors
 from vla_eval.training.dataset import training_dataset
@@ -47,7 +47,7 @@ OPENVLA = Ported(
     layers="llm.model.layers",
     policy=MikasaOpenVLAPolicy,
     make_processors=make_mikasa_openvla_pre_post_processors,
-    prompt_text=openvla_prompt.prompt_text,
+    prompt_text=processor_openvla.prompt_text,
 )
 SPATIALVLA = Ported(
     recipe="spatialvla_tiny",
@@ -55,7 +55,7 @@ SPATIALVLA = Ported(
     layers="llm.layers",
     policy=MikasaSpatialVLAPolicy,
     make_processors=make_mikasa_spatialvla_pre_post_processors,
-    prompt_text=spatialvla_prompt.prompt_text,
+    prompt_text=processor_spatialvla.prompt_text,
 )
 
 

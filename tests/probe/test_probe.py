@@ -11,7 +11,7 @@ import pytest
 
 from tests.evaluation.resolved import results_config
 from vla_eval.cli.main import main
-from vla_eval.config.appearance import AppearanceSettings
+from vla_eval.config.environment import AppearanceSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
 from vla_eval.probe.interventions import plan_probe

@@ -12,7 +12,7 @@ import pytest
 
 from vla_eval.cli.main import main
 from vla_eval.storage.run_folder import read_run
-from vla_eval.strict.renamed import warn_renamed
+from vla_eval.strict.decoding import warn_renamed
 
 STORED = Path(__file__).parents[1] / "golden" / "old_run"
 CAPTURED = "RememberColor3-v0_scripted_K1_run0_seed1_failure"

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import vla_eval
-from vla_eval.config import shipped
+from vla_eval.config import files
 from vla_eval.storage import provenance
 from vla_eval.storage.provenance import checkout_state, collect_environment
 
@@ -38,7 +38,7 @@ def package(tmp_path: Path) -> Path:
 
 def test_what_is_looked_at_is_the_whole_package() -> None:
     root = Path(vla_eval.__file__).parent
-    assert root == provenance.PACKAGE_FOLDER == shipped.PACKAGE_ROOT
+    assert root == provenance.PACKAGE_FOLDER == files.PACKAGE_ROOT
 
 
 class TestCheckout:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from tests.tasks.made_tasks import make
-from vla_eval.config.appearance import AppearanceSettings
-from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.config.environment import AppearanceSettings, EnvSettings, RenderSettings
 from vla_eval.core import Observation
 from vla_eval.cue_view import GREY, CueBoxes, CueView, CueViewKind, CueViewSettings
 from vla_eval.envs.factory import make_env

@@ -10,14 +10,13 @@ import torch
 import torchvision
 from torchvision.models import WeightsEnum
 
-from vla_eval.checkpoints.bases import how_to_get
+from vla_eval.checkpoints.bases import FOLDER, how_to_get
 from vla_eval.checkpoints.closed_doors import let_through
 from vla_eval.checkpoints.files import WEIGHTS_FILE
 from vla_eval.errors import CheckpointError
 from vla_eval.models.weights.exact import listed
 from vla_eval.models.weights.file import WeightFile
 
-FOLDER = Path("checkpoints")
 FETCHED: Mapping[str, str] = {"ResNet18_Weights.IMAGENET1K_V1": "resnet18"}
 """torchvision's name of weights -> the base that holds them."""
 NOT_IN_OLD_FILES = "num_batches_tracked"

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.checkpoints.bases import how_to_get, hub_folder
-from vla_eval.config.shipped import search_folders
+from vla_eval.config.files import search_folders
 from vla_eval.errors import CheckpointError, RecipeError, did_you_mean
 from vla_eval.lock.switch import distrust
 from vla_eval.seeding import SeedRange

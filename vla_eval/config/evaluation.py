@@ -5,9 +5,8 @@ from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 from vla_eval.chunking import ChunkingSettings
-from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
 from vla_eval.config.capture import CaptureConfig
-from vla_eval.config.environment import RenderSettings, SimBackend, Simulator
+from vla_eval.config.environment import AS_DESIGNED, AppearanceSettings, RenderSettings, SimBackend, Simulator
 from vla_eval.config.files import check_run_name
 from vla_eval.cue_view import CueViewKind
 from vla_eval.strict.bounds import (
@@ -22,8 +21,7 @@ from vla_eval.strict.bounds import (
     check_seeds,
     require,
 )
-from vla_eval.strict.decoding import read_by
-from vla_eval.strict.renamed import formerly
+from vla_eval.strict.decoding import formerly, read_by
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,13 +16,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
-from vla_eval.config.shipped import search_folders
+import vla_eval
 from vla_eval.errors import MAX_SHOWN, RecipeError, UnknownNameError, did_you_mean, unknown_name
 from vla_eval.records import is_name
 from vla_eval.strict.bounds import require
 from vla_eval.strict.decoding import decode, set_field
 from vla_eval.strict.yaml_data import MAX_CHARACTERS, load_yaml
 
+PACKAGE_ROOT = Path(vla_eval.__file__).parent
 Folder = Literal["configs", "policies", "prompts", "datasets", "protocols"]
 
 
@@ -50,6 +51,14 @@ def check_recorded_name(name: str, *, kind: str) -> None:
             f"or '_' and has neither '/' nor '\\', no line breaks and no other control characters. Rename "
             f"the file."
         )
+
+
+def search_folders(kind: str) -> tuple[Path, ...]:
+    """Return the folders with files of a kind (`configs`, `datasets` …): the user's, the package's."""
+    packaged = PACKAGE_ROOT / "recipes_data" / kind
+    # An editable checkout has no recipes_data: these folders are next to the package.
+    shipped = packaged if packaged.is_dir() else PACKAGE_ROOT.parent / kind
+    return tuple(dict.fromkeys((Path.cwd() / kind, shipped)))
 
 
 def list_recipes(folder: Folder) -> dict[str, Path]:

@@ -8,13 +8,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
-from vla_eval.config.files import Recipe, load_recipe, to_data
+from vla_eval.config.files import Recipe, load_recipe, search_folders, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, merge_fields
-from vla_eval.config.shipped import search_folders
 from vla_eval.errors import UnknownNameError
 from vla_eval.strict.bounds import MAX_PROCESSES, Bounds, Steps, check_bounds
-from vla_eval.strict.decoding import decode, load_yaml
-from vla_eval.strict.renamed import warn_renamed
+from vla_eval.strict.decoding import decode, load_yaml, warn_renamed
 
 ABLATIONS = "ablations"
 

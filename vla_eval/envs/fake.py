@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.config.appearance import AS_DESIGNED
-from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
+from vla_eval.config.environment import AS_DESIGNED, HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox

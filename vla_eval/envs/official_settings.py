@@ -2,8 +2,7 @@
 
 from typing import Literal
 
-from vla_eval.config.appearance import AS_DESIGNED
-from vla_eval.config.environment import EnvSettings
+from vla_eval.config.environment import AS_DESIGNED, EnvSettings
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.tasks.arguments import HORIZON, check_argument
 from vla_eval.tasks.objects.limits import SomeSteps

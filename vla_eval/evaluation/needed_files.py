@@ -6,7 +6,7 @@ from pathlib import Path
 
 from vla_eval.checkpoints.files import SHIPPED_FOLDER, adapter_bases, checkpoint_sha256, find_checkpoint
 from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
-from vla_eval.config.shipped import search_folders
+from vla_eval.config.files import search_folders
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.workers.needed_files import Needed
 from vla_eval.workers.parcel import fits

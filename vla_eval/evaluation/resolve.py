@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Self  # Any: plain data
 
 from vla_eval.checkpoints.notes import COMPILE, LEROBOT_CHECKPOINTS
-from vla_eval.config.appearance import AS_DESIGNED
+from vla_eval.config.environment import AS_DESIGNED
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import Recipe, content_of, digest_of
 from vla_eval.config.policy import PolicyRecipe

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
-from vla_eval.config.appearance import AS_DESIGNED
+from vla_eval.config.environment import AS_DESIGNED
 from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.errors import RecipeError
 from vla_eval.probe.worlds import APPEARANCES, AS_DRAWN, Intervention, ProbeSettings, TaskWorlds, World

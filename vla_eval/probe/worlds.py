@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from vla_eval.config.appearance import AppearanceSettings
+from vla_eval.config.environment import AppearanceSettings
 from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.cue_view import CueViewKind
 from vla_eval.probe.phases import Phases, default_delay_steps, fixed_phases

@@ -8,6 +8,7 @@ would wait 0.15 s for it.
 
 import dataclasses
 import functools
+import logging
 import math
 import types
 from collections.abc import Callable, Mapping, Sequence
@@ -16,10 +17,11 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_ty
 from vla_eval.errors import MAX_SHOWN, RecipeError, did_you_mean
 from vla_eval.strict.bounds import MAX_DEPTH
 from vla_eval.strict.json_text import WORDS, shown, wrong
-from vla_eval.strict.renamed import current_names, use_current_names, warn_renamed
 from vla_eval.strict.yaml_data import load_yaml as load_yaml
 
-READ = "read"
+logger = logging.getLogger(__name__)
+
+READ, FORMERLY = "read", "formerly"
 
 
 def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
@@ -34,6 +36,42 @@ def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
 def read_by(read: Callable[[Any], Any]) -> dict[str, Any]:  # Any: plain data, not yet checked
     """Return the metadata of a dataclass field that may be written in another way; `read` rewrites it."""
     return {READ: read}
+
+
+def formerly(name: str) -> dict[str, str]:
+    """Return the metadata of a dataclass field that older files call by another name.
+
+    Both names work, the old one with one warning: `field(default=None, metadata=formerly("evaluation"))`.
+    """
+    return {FORMERLY: name}
+
+
+def current_names(cls: type) -> dict[str, str]:
+    """Return old name -> current name of the renamed fields of a dataclass."""
+    fields = (field for field in dataclasses.fields(cls) if FORMERLY in field.metadata)
+    return {field.metadata[FORMERLY]: field.name for field in fields}
+
+
+def use_current_names(cls: type, data: dict[str, Any], *, prefix: str) -> None:
+    """Give the renamed fields in the plain data of a dataclass their current names, in place."""
+    for old, new in current_names(cls).items():
+        if old not in data:
+            continue
+        if new in data:
+            raise RecipeError(
+                f"'{prefix}{old}' is the old name of '{prefix}{new}', and both are there. "
+                f"Keep '{prefix}{new}'."
+            )
+        warn_renamed(f"'{prefix}{old}'", f"'{prefix}{new}'")
+        data[new] = data.pop(old)
+
+
+@functools.cache  # one warning per name and process
+def warn_renamed(old: str, new: str) -> None:
+    """Log that something has a new name."""
+    logger.warning(
+        "warning: %s is now called %s. The old name still works; please use the new one.", old, new
+    )
 
 
 def check_value(hint: Any, value: object, *, path: str) -> Any:  # Any: a type annotation, and such a value

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_eval.config.evaluation import TimeoutConfig
-from vla_eval.config.files import find_recipe
-from vla_eval.config.shipped import search_folders
+from vla_eval.config.files import find_recipe, search_folders
 from vla_eval.errors import FolderInUseError, RecipeError, TrainingError
 from vla_eval.evaluation.model_table import (
     Finetuning,

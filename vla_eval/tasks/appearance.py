@@ -12,7 +12,7 @@ import sapien
 from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs import Pose
 
-from vla_eval.config.appearance import AS_DESIGNED, AppearanceSettings
+from vla_eval.config.environment import AS_DESIGNED, AppearanceSettings
 
 MOVED_CAMERA = "base_camera"  # the other one is a part of the robot
 FURNITURE = ("table-workspace", "ground")

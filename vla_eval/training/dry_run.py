@@ -18,8 +18,13 @@ from vla_eval.models.shared.original import with_features
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.cost.estimate import Estimate, estimate, estimate_lines, unfilled_model
 from vla_eval.training.dataset import chosen_episodes, training_dataset
-from vla_eval.training.lora import check_lora_targets
-from vla_eval.training.policy_config import asked_policy, decoded_policy, fit_to_dataset, used_frames
+from vla_eval.training.policy_config import (
+    asked_policy,
+    check_lora_targets,
+    decoded_policy,
+    fit_to_dataset,
+    used_frames,
+)
 from vla_eval.training.request import load_finetune_recipe, run_folder_of
 from vla_eval.training.run_folder import newest_step
 

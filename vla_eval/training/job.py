@@ -19,12 +19,13 @@ from vla_eval.models.shared.earlier_frames import SampleMemory
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.training.dataset import chosen_episodes, training_dataset
 from vla_eval.training.held_out import check_asked, check_held_out
-from vla_eval.training.lora import check_lora_targets, peft_config
 from vla_eval.training.policy_config import (
     UsedFrames,
     asked_policy,
+    check_lora_targets,
     fit_to_dataset,
     image_transforms,
+    peft_config,
     used_frames,
 )
 from vla_eval.training.request import load_finetune_recipe, run_folder_of

@@ -37,7 +37,7 @@ from tqdm import tqdm
 from vla_eval.data.frames.decoded_frames import DecodedFramesDataset
 from vla_eval.data.frames.remembered_frames import RememberedFramesDataset
 from vla_eval.errors import TrainingError
-from vla_eval.models.shared.levels import in_numbers
+from vla_eval.models.shared.images import in_numbers
 from vla_eval.models.shared.sentence_reading import SentenceReading
 from vla_eval.models.shared.tokens_read import Readings
 from vla_eval.policies.lerobot.device import amp_dtype

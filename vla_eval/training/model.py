@@ -24,7 +24,7 @@ from vla_eval.errors import RecipeError, TrainingError
 from vla_eval.models.families import family_of
 from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP
 from vla_eval.training.job import TrainingJob
-from vla_eval.training.lora import check_adapters, peft_config
+from vla_eval.training.policy_config import check_adapters, peft_config
 
 TOKENIZER_STEP = "TokenizerProcessorStep"
 

@@ -16,7 +16,7 @@ from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import CheckpointError
-from vla_eval.models.octo.original import unpack
+from vla_eval.models.octo.conversion import unpack
 from vla_eval.training.finetune import finetune
 
 N_BYTES = 260  # 256, three special tokens, and one to spare

@@ -16,7 +16,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.results.formats import FORMATS
 from vla_eval.storage.shard import Shard
 from vla_eval.strict.bounds import MAX_EPISODES, check_seeds
-from vla_eval.strict.renamed import warn_renamed
+from vla_eval.strict.decoding import warn_renamed
 
 if TYPE_CHECKING:
     from vla_eval.training.dry_run import DryRunOptions

@@ -17,8 +17,8 @@ from vla_eval.data.frames.frame_cache import frame_source, frames_in_ram, frames
 from vla_eval.data.tables import as_array, holds_numbers
 from vla_eval.errors import DatasetError, check_names
 from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind
-from vla_eval.models.shared.levels import in_numbers
-from vla_eval.strict.renamed import warn_renamed
+from vla_eval.models.shared.images import in_numbers
+from vla_eval.strict.decoding import warn_renamed
 
 Storage = Literal["disk", "ram"]
 Sample = dict[str, Any]  # Any: tensors, and the task's sentence

@@ -21,7 +21,7 @@ from vla_eval.features import (
     STATE_NAMES,
     SUCCESS_KEY,
 )
-from vla_eval.models.shared.levels import in_bytes
+from vla_eval.models.shared.images import in_bytes
 from vla_eval.task_state import PHASES
 from vla_eval.viz.rerun_file import layout, rrd_when_whole, send_curve, set_step, time_columns
 from vla_eval.viz.rerun_log import COLORS, JPEG_QUALITY, log_arm

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from torch import Tensor
 
-from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.images import MAX_LEVEL
 
 Bytes = NDArray[np.uint8]
 Mask = NDArray[np.bool_]

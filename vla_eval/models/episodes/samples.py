@@ -8,7 +8,7 @@ from torch import Tensor
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.models.episodes.color_objects import changed_things
 from vla_eval.models.episodes.config import SPACE, EpisodeConfig
-from vla_eval.models.shared.levels import in_bytes, in_numbers
+from vla_eval.models.shared.images import in_bytes, in_numbers
 from vla_eval.models.shared.ported_config import PortedConfig
 
 LEAST_VARIANCE_M2 = 1e-6

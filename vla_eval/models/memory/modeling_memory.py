@@ -22,7 +22,7 @@ from vla_eval.models.memory.configuration_memory import TYPE, MikasaMemoryConfig
 from vla_eval.models.memory.goal_layer import by_camera
 from vla_eval.models.memory.network import Answer, Memory, MemoryNetwork
 from vla_eval.models.memory.sizes import NetworkSizes
-from vla_eval.models.shared.levels import in_numbers
+from vla_eval.models.shared.images import in_numbers
 from vla_eval.models.shared.network_sizes import sizes_from
 
 SAME_JOINTS = 0.05  # of joints, in units of the network: noise also moves an arm that holds still

@@ -16,8 +16,7 @@ from vla_eval.models.octo.diffusion_head import Targets, draw
 from vla_eval.models.octo.flax_names import is_kernel
 from vla_eval.models.octo.language import PromptEmbeddings, make_text_encoder
 from vla_eval.models.octo.transformer import OctoNetwork, Window
-from vla_eval.models.shared.images import Size, augment, resize_and_centre_crop, resize_lanczos3
-from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.images import MAX_LEVEL, Size, augment, resize_and_centre_crop, resize_lanczos3
 from vla_eval.models.weights.trainable import set_trainable
 
 INDEX_KEY = "index"  # of a frame in the dataset

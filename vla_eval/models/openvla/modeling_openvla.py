@@ -16,8 +16,14 @@ from vla_eval.models.openvla.configuration_openvla import (
 from vla_eval.models.openvla.generation import generated_actions, parallel_actions, token_loss
 from vla_eval.models.openvla.network import Inputs, OpenVLANetwork, finished
 from vla_eval.models.shared.chunks import PromptedChunks
-from vla_eval.models.shared.images import Size, augment, centre_crop, resize_lanczos3, truncated_levels
-from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.images import (
+    MAX_LEVEL,
+    Size,
+    augment,
+    centre_crop,
+    resize_lanczos3,
+    truncated_levels,
+)
 from vla_eval.models.shared.precision import default_dtype
 
 

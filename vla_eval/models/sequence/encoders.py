@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from vla_eval.models.sequence.sizes import ENCODERS, NATURE_LAYERS, nature_edges
-from vla_eval.models.shared.levels import in_numbers
+from vla_eval.models.shared.images import in_numbers
 from vla_eval.models.shared.precision import in_float32
 
 RGB = 3

@@ -8,7 +8,7 @@ from lerobot.utils.constants import OBS_LANGUAGE_ATTENTION_MASK, OBS_LANGUAGE_TO
 from torch import Tensor
 
 from vla_eval.errors import SpecMismatchError, TrainingError
-from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.images import MAX_LEVEL
 
 
 class PromptedChunks:

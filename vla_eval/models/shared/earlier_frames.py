@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from vla_eval.models.shared.frame_choice import FrameChoice, Seen
-from vla_eval.models.shared.levels import in_bytes
+from vla_eval.models.shared.images import in_bytes
 
 SEGMENT_PADDING_KEY = "segment_is_pad"
 """(B, T) of a training batch in segments: which come before the episode's beginning."""

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from vla_eval.core import ImageArray
 from vla_eval.errors import RecipeError, check_names
-from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.images import MAX_LEVEL
 
 BLOCKS = (8, 16, 32)  # per side of an image; of 128 px: 16, 8 and 4 px
 NEAR, FAR = 2, 5  # blocks: what changes between these distances from a block is its surroundings

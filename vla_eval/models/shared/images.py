@@ -19,12 +19,22 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import RecipeError
-from vla_eval.models.shared.levels import MAX_LEVEL
 from vla_eval.models.shared.precision import in_float32
 
+MAX_LEVEL = 255.0  # of a channel
 LANCZOS_RADIUS = 3.0
 CUBIC_A = -0.5  # of PIL's bicubic kernel; torch's own has -0.75 where it does not antialias
 PIL_PRECISION = 1 << 22  # steps of PIL's weights
+
+
+def in_numbers(images: Tensor) -> Tensor:
+    """Return images in [0, 1], given that or bytes. Of bytes it takes a while: leave padding out first."""
+    return images.to(torch.float32).div_(MAX_LEVEL) if images.dtype == torch.uint8 else images
+
+
+def in_bytes(images: Tensor) -> Tensor:
+    """Return images as bytes, given that or numbers in [0, 1]."""
+    return images if images.dtype == torch.uint8 else images.mul(MAX_LEVEL).round_().to(torch.uint8)
 
 
 class Size(NamedTuple):

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from vla_eval.errors import CheckpointError
-from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.images import MAX_LEVEL
 from vla_eval.models.shared.original import CONFIG_FILE
 from vla_eval.models.shared.siglip import LAYER_NORM_EPS
 from vla_eval.models.spatialvla.action_grid import AXES

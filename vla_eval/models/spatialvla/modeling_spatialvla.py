@@ -8,8 +8,7 @@ from torch import Tensor
 
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY
 from vla_eval.models.shared.chunks import PromptedChunks
-from vla_eval.models.shared.images import Size, resize_bicubic
-from vla_eval.models.shared.levels import MAX_LEVEL
+from vla_eval.models.shared.images import MAX_LEVEL, Size, resize_bicubic
 from vla_eval.models.shared.precision import default_dtype
 from vla_eval.models.spatialvla.action_grid import refitted
 from vla_eval.models.spatialvla.configuration_spatialvla import TYPE, MikasaSpatialVLAConfig

@@ -1,21 +1,27 @@
-"""What scripted controls share: their spec, their random generators, and how to hold still."""
+"""What scripted controls share: spec, random generators, how to hold still, and other control modes."""
 
+import functools
 import importlib
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.control_modes import EE_DELTA_POS, EE_DELTA_POSE, action_spec
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import gripper_command
+from vla_eval.oracles.translation import translated
 from vla_eval.policies.context import PolicyContext
 from vla_eval.seeding import Stream, generator
 from vla_eval.specs import PolicySpec
 from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
+
+JOINT_STATES = ("qpos", "qvel")
 
 
 def hold_rows(gripper_width_m: float, n_actions: int, n_dims: int = 7) -> NDArray[np.float32]:
@@ -90,3 +96,49 @@ class ScriptedPolicy:
                 f"{self._context.env.task} carry none. Make the environment with privileged=True."
             )
         return state
+
+
+class TranslatedPolicy:
+    """A scripted control whose chunks, planned in `pd_ee_delta_pose`, are translated to another mode."""
+
+    def __init__(self, planner: ScriptedPolicy, mode: str) -> None:
+        self._planner = planner
+        self._mode = mode
+        states = tuple(dict.fromkeys((*planner.spec.states, *JOINT_STATES)))
+        self.spec = replace(planner.spec, states=states)
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Begin these episodes."""
+        self._planner.reset(episodes)
+
+    def forget(self, slots: Sequence[int]) -> None:
+        """Release what the planner knows of these slots."""
+        self._planner.forget(slots)
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Plan a chunk, and translate it."""
+        state = window.last.state
+        planned = self._planner.act(window).actions
+        qpos, qvel = (state[name].astype(float) for name in JOINT_STATES)
+        return ActionChunk(actions=translated(planned, self._mode, qpos, qvel))
+
+
+def in_any_control_mode(
+    make: Callable[[PolicyContext], ScriptedPolicy],
+) -> Callable[[PolicyContext], ScriptedPolicy | TranslatedPolicy]:
+    """Make controls for every control mode; refuse one without rotation where the expert turns the wrist."""
+
+    @functools.wraps(make)
+    def made(context: PolicyContext) -> ScriptedPolicy | TranslatedPolicy:
+        mode = context.env.action.control_mode
+        if mode == EE_DELTA_POSE:
+            return make(context)
+        planner = make(replace(context, env=replace(context.env, action=action_spec(EE_DELTA_POSE))))
+        if mode == EE_DELTA_POS and planner.privileged and task_spec(context.env.task).turns_wrist:
+            raise SpecMismatchError(
+                f"policy '{context.name}': the expert of {context.env.task} turns the wrist, and the control "
+                f"mode {mode} has no rotation. Choose another env.control_mode, or leave this task out."
+            )
+        return TranslatedPolicy(planner, mode)
+
+    return made

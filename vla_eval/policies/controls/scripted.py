@@ -8,7 +8,14 @@ from numpy.typing import NDArray
 
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.controls.base import ScriptedPolicy, check_has, hold_rows, task_expert
+from vla_eval.policies.controls.base import (
+    ScriptedPolicy,
+    TranslatedPolicy,
+    check_has,
+    hold_rows,
+    in_any_control_mode,
+    task_expert,
+)
 from vla_eval.policies.controls.candidate_controls import (
     CandidateExpert,
     ChoicePolicy,
@@ -16,7 +23,6 @@ from vla_eval.policies.controls.candidate_controls import (
     VisitExpert,
     VisitPolicy,
 )
-from vla_eval.policies.controls.in_control_mode import TranslatedPolicy, in_any_control_mode
 from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 

@@ -13,9 +13,14 @@ from vla_eval.oracles.arm_model import GRIPPER_MAX_WIDTH_M
 from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, ROLLING_SHARE
 from vla_eval.oracles.hover import CUBES, MUGS
 from vla_eval.policies.context import PolicyContext
-from vla_eval.policies.controls.base import ScriptedPolicy, check_has, hold_rows, task_expert
+from vla_eval.policies.controls.base import (
+    ScriptedPolicy,
+    check_has,
+    hold_rows,
+    in_any_control_mode,
+    task_expert,
+)
 from vla_eval.policies.controls.candidate_controls import CandidateExpert
-from vla_eval.policies.controls.in_control_mode import in_any_control_mode
 from vla_eval.policies.controls.scripted import BallExpertFactory
 from vla_eval.task_state import BodyState, PrivilegedState
 from vla_eval.tasks.catalog import task_spec

@@ -13,7 +13,7 @@ from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.evaluation.model_table import SUSTAINED_TFLOPS
 from vla_eval.models.weights.empty import empty_weights
 from vla_eval.training.cost.sample_cost import SampleCost, sample_cost
-from vla_eval.training.lora import peft_config
+from vla_eval.training.policy_config import peft_config
 
 KEPT_FREE = 0.05  # of a device's memory, for its runtime and fragmentation
 CPU_TFLOPS = 0.1
