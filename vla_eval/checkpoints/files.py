@@ -52,8 +52,6 @@ class TrainingFacts:
         task: the task of the demonstrations; empty if they are of several, or of none that is known.
         state: which proprioception `observation.state` was: `eef` or `joints`.
         images: image fields of the dataset, in the policy's order -> (height_px, width_px).
-        fps: control steps per second.
-        control_mode: what an action means.
         seeds: task -> the seeds whose demonstrations these are; None if not known: another program's seed is
             another episode, and earlier versions did not note them.
         tasks: all tasks of the demonstrations; empty where they are not known.

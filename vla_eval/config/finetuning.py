@@ -29,21 +29,13 @@ LOGGERS = ("wandb_project", "trackio_project", "tensorboard")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LoraRecipe:
-    """Train low-rank adapters instead of all weights.
-
-    Attributes:
-        rank: of the adapters.
-        alpha: scaling is alpha / rank; None: alpha = rank (peft would take 8, whatever the rank).
-        target_modules: regular expression of the modules that get one; None: lerobot's choice, which for
-            π0 and π0.5 is the action expert's attention and the projections, not the language model.
-            `all-linear` is refused: it would take heads and embeddings, too.
-        full_modules: last names of modules that are trained in full in addition to the adapters.
-    """
+    """Train low-rank adapters instead of all weights."""
 
     rank: Rank = 16
-    alpha: Rank | None = None
+    alpha: Rank | None = None  # scaling is alpha / rank; None: alpha = rank (peft would take 8)
+    # regular expression of the modules that get one; None: the choice of our policy, or of lerobot
     target_modules: str | None = None
-    full_modules: tuple[str, ...] = ()
+    full_modules: tuple[str, ...] = ()  # last names of modules that are trained in full in addition
 
     def __post_init__(self) -> None:
         check_bounds(self, prefix="finetune.lora.")
@@ -56,29 +48,7 @@ class LoraRecipe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneRecipe:
-    """How to fine-tune one type of policy.
-
-    Attributes:
-        type: lerobot's name of the policy: `act`, `diffusion`, `smolvla`, `pi0`, `pi05`, `pi0_fast`, or
-            that of a plugin.
-        policy: fields of lerobot's configuration of that type, among them optimizer and schedule.
-        base_checkpoint: folder with the weights to start from; None: from scratch.
-        tokenizer: folder of the tokenizer; None: the one that the policy names, from the local cache.
-        rename_cameras: field of the dataset -> field of the base checkpoint.
-        batch_size: samples per step and process.
-        micro_batch_size: how many of them go through the network at once; None: all. Gradients are added up
-            (gradient accumulation), so that the step is the same with less of the device's memory.
-        save_every_steps, log_every_steps: when checkpoints and metrics are written.
-        num_workers: processes that load samples, at most; no more than there are cores.
-        failed_episodes: what happens to the dataset's episodes without success; None: policies that learn
-            from rewards keep them, all others leave them out.
-        decode_ahead: decode each frame once into the user's cache, instead of once per sample.
-        image_transforms: augmentation, fields of lerobot's `ImageTransformsConfig` (`max_num_transforms`,
-            `random_order`, `tfs`); {}: its own six; None: images as they are.
-        imagenet_statistics: normalise images by ImageNet's statistics, for backbones trained on it.
-        wandb_project, trackio_project: log there, too.
-        tensorboard: log to the folder `tensorboard` of the run, too.
-    """
+    """How to fine-tune one type of policy. `docs/finetuning.md` has the table of all fields."""
 
     type: str
     policy: dict[str, Any] = field(default_factory=dict)  # Any: lerobot checks its own fields
@@ -123,12 +93,7 @@ class FinetuneRecipe:
 class HeldOutConfig:
     """Evaluate checkpoints on held-out seeds during training. Moves no weight.
 
-    Attributes:
-        every_steps: a multiple of `save_every_steps`; the last checkpoint is evaluated in any case.
-        episodes, seed_start: on which seeds; none of those that tables or demonstrations are made from.
-        task: task id; None: the dataset's.
-        n_action_steps: actions executed per inference; None: the policy's own number.
-        simulator, slots_per_worker, workers: see `EvalConfig`.
+    `docs/finetuning.md` has the table of all fields.
     """
 
     every_steps: TrainingSteps

@@ -40,11 +40,9 @@ def bare_policy(name: str) -> str:
 def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
     """Return the recipe of a policy, or one for the checkpoint in a folder or for the server at an address.
 
-    Args:
-        name: the name of a recipe, its file, or a folder: a fine-tuning run, a checkpoint in it, or a
-            LeRobot checkpoint; or `hub:OWNER/NAME@REVISION`, which is fetched if it is not there. The
-            recipe's digest is then that of the checkpoint's files. Or the address of a policy server,
-            `ws://HOST:PORT`, with commas if there are several, maybe after `RECIPE@`.
+    `name` is a recipe's name or file; a folder: a fine-tuning run, a checkpoint in it, or a LeRobot
+    checkpoint; `hub:OWNER/NAME@REVISION`, which is fetched if it is not there (the recipe's digest is that of
+    the checkpoint's files); or `ws://HOST:PORT`, with commas if there are several, maybe after `RECIPE@`.
 
     Raises:
         UnknownNameError, RecipeError: see `load_recipe`.

@@ -86,9 +86,6 @@ def own_modules(adapters: Iterable[str]) -> tuple[str, ...]:
 def policy_factory(adapter: str) -> PolicyFactory:
     """Return the function that makes policies of this adapter.
 
-    Args:
-        adapter: a name from the registry, or `module:attr`.
-
     Raises:
         UnknownNameError: there is no such adapter, module or attribute.
         MissingDependencyError: the adapter's module needs a package that is not installed.

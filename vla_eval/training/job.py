@@ -37,14 +37,11 @@ class TrainingJob:
     """One fine-tuning.
 
     Attributes:
-        name, recipe_sha256: of the policy's recipe.
-        recipe: its section `finetune`, with the configuration's values on top.
+        recipe: the section `finetune` of the policy's recipe, with the configuration's values on top.
         policy: lerobot's configuration of the policy, which it completes when the model is made.
         frames: how many of the dataset's frames begin a chunk.
         base: folder of the weights to start from; None: from scratch.
         below: what those were trained on; None: from scratch, or not known.
-        run_seed: of initial weights, order of samples and noise.
-        held_out: evaluation of checkpoints during training; None: there is none.
         resume_from: folder of the checkpoint (`…/000100`) to resume from; None: from the beginning.
         run_id: names the run to services, also when it is resumed; None: it has no folder yet.
     """

@@ -43,14 +43,9 @@ class MikasaOctoConfig(PortedConfig):
         trained: which parameters are trained, see `TRAINED`.
         remember_readouts: compute the frozen trunk's output for each training frame once; needs
             `trained: heads` and no augmentation. Another recipe than the paper's, see `docs/octo.md`.
-        width, layers, heads, mlp_width, stem_channels, stem_features: see `TransformerSizes`.
-        head_hidden, head_blocks, head_time, diffusion_steps, max_action: see `HeadSizes`.
+        width, …: see `TransformerSizes`, `HeadSizes`, `T5Sizes`, `Augmentation`, `Gripper`.
         language_tokens: tokens of an instruction; longer ones are cut, as in the original.
-        t5: sizes of the text encoder, see `T5Sizes`; what is not named is t5-base's.
-        tokenizer_name: folder or name of the tokenizer, or `bytes`.
-        primary_crop_area, primary_crop_ratio, brightness, contrast, saturation, hue: augmentation, see
-            `Augmentation`; only the first camera is cropped, and in evaluation its middle is taken.
-        gripper_encoding, gripper_decoding: see `Gripper`.
+        primary_crop_area: only the first camera is cropped, and in evaluation its middle is taken.
         normalize_gripper: whether the gripper is normalised, too; the original leaves it alone.
         optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
             scheduler_decay_steps: AdamW (decay on `flax_names.is_kernel` alone), warm-up, cosine to 0.
