@@ -3,6 +3,7 @@
 from collections.abc import Hashable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.workers.jobs import Job
@@ -17,6 +18,7 @@ class FinetuneJob(Job):
     config: FinetuneConfig
     command: str
     name: str
+    n_items: ClassVar[int] = 1
 
     @property
     def setup_key(self) -> Hashable:

@@ -78,11 +78,6 @@ class TrainingJob:
         return bool(getattr(self.policy, "whole_episodes", False))
 
     @property
-    def takes_bytes(self) -> bool:
-        """Whether the policy makes numbers of the images itself."""
-        return bool(getattr(self.policy, "takes_bytes", False))
-
-    @property
     def reward(self) -> RewardKind | None:
         """Which rewards the policy is trained on; None: it reads none."""
         return getattr(self.policy, "reward", None)

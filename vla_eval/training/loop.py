@@ -154,7 +154,7 @@ class _Training:
         """Do one gradient step, counted from 1; return what was read of sentences that are new."""
         tracker, started, n_known = self.tracker, time.perf_counter(), len(self.readings.known)
         batch = next(self.batches)
-        for key in () if self.job.takes_bytes else self.images:
+        for key in () if getattr(self.job.policy, "takes_bytes", False) else self.images:
             if key in batch:
                 batch[key] = in_numbers(batch[key])
         with self.readings.of(batch.get("task") or ()):

@@ -77,7 +77,7 @@ class DiffusionHead(nn.Module):
 
     def __init__(self, sizes: HeadSizes) -> None:
         super().__init__()
-        self.sizes = sizes
+        self.sizes, self.n_steps = sizes, sizes.diffusion_steps
         self.frequencies = nn.Parameter(torch.randn(sizes.time // 2, 1) * 0.2)
         self.time_fc1 = nn.Linear(sizes.time, 2 * sizes.time)
         self.time_fc2 = nn.Linear(2 * sizes.time, sizes.time)
@@ -88,11 +88,6 @@ class DiffusionHead(nn.Module):
     def schedule(self) -> Schedule:
         """Return the schedule on the head's device."""
         return Schedule(*(part.to(self.frequencies.device) for part in cosine_schedule(self.n_steps)))
-
-    @property
-    def n_steps(self) -> int:
-        """Diffusion steps."""
-        return self.sizes.diffusion_steps
 
     @in_float32
     def forward(self, condition: Tensor, noisy: Tensor, time: Tensor) -> Tensor:

@@ -20,6 +20,8 @@ from vla_eval.strict.bounds import require
 class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untyped
     """A policy that predicts chunks and is trained with AdamW."""
 
+    reward_delta_indices: ClassVar[Any] = None  # no rewards, unless a policy says otherwise
+
     chunk_size: int = 8  # actions of a chunk
     # how many lerobot's own loop executes, the first ones; ours sets its own number
     n_action_steps: int = 8
@@ -49,11 +51,6 @@ class PortedConfig(PreTrainedConfig):  # type: ignore[misc]  # lerobot is untype
         shapes = {tuple(feature.shape) for feature in self.image_features.values()}
         if len(shapes) != 1:
             raise ValueError(f"'{self.type}' needs images of one size, found {sorted(shapes)}")
-
-    @property
-    def reward_delta_indices(self) -> list[int] | None:
-        """No rewards, unless a policy says otherwise."""
-        return None
 
     def get_optimizer_preset(self) -> Any:
         """Return lerobot's configuration of AdamW."""

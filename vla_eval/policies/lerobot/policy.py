@@ -35,7 +35,6 @@ from vla_eval.models.episodes.running import (
 )
 from vla_eval.models.families import family_of
 from vla_eval.models.shared.earlier_frames import FrameMemory
-from vla_eval.models.shared.sentence_reading import SentenceReading
 from vla_eval.models.shared.tokens_read import Readings
 from vla_eval.policies.compiled import Compilation
 from vla_eval.policies.context import PolicyContext
@@ -108,6 +107,8 @@ class LeRobotPolicy:
         self._n_slots, self._is_compiled = n_slots, is_compiled
         self._slots: dict[int, Episode] = {}
         self._readings = Readings()
+        self.readings = self._readings.known
+        self.proprioception = inputs.state
         reads_more = self._remembers or self._by_step or self._earlier is not None or len(self._deltas) > 1
         self.spec = PolicySpec(
             name=name,
@@ -126,16 +127,6 @@ class LeRobotPolicy:
         """Release the frames and the memory of these slots."""
         for slot in slots:
             self._slots.pop(slot, None)
-
-    @property
-    def readings(self) -> Mapping[str, SentenceReading]:
-        """What the network was given of each sentence."""
-        return self._readings.known
-
-    @property
-    def proprioception(self) -> StateKind | None:
-        """Which proprioception it reads."""
-        return self._inputs.state
 
     def warm_up(self, env: EnvSpec, sentences: Sequence[str]) -> Compilation | None:
         """Compile for these sentences, in the thread that will ask it; None: it is not to be compiled."""

@@ -36,7 +36,7 @@ class RemotePolicy:
         action: ActionSpec,
     ) -> None:
         """Keep the connections by slot; the same one for all where the server can distinguish them."""
-        self._spec = spec
+        self.spec = spec
         self._clients = clients
         self._fit = fit
         self._settings = settings
@@ -46,11 +46,6 @@ class RemotePolicy:
         self._sessions = {slot: f"{prefix}-{slot}" for slot in clients}
         self._instructions: dict[int, str] = {}
         self.readings: dict[str, SentenceReading] = {}
-
-    @property
-    def spec(self) -> PolicySpec:
-        """What the policy reads and how long its chunks are."""
-        return self._spec
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Begin an episode in the session of each slot."""
@@ -85,12 +80,12 @@ class RemotePolicy:
         chunk = self._chunk(client.take_infer(session))
         said = client.take_reading(session)
         if said is not None and sentence not in self.readings:
-            self.readings[sentence] = from_wire(sentence, said, where=f"policy '{self._spec.name}'")
+            self.readings[sentence] = from_wire(sentence, said, where=f"policy '{self.spec.name}'")
         return chunk
 
     def _chunk(self, actions: Any) -> ActionChunk:
         rows = as_rows(actions)
-        shape = (self._spec.chunk_size, len(self._action.dims))
+        shape = (self.spec.chunk_size, len(self._action.dims))
         is_sound = isinstance(rows, np.ndarray) and rows.shape == shape and rows.dtype == np.float32
         if self._settings.actions is not None and is_sound and np.isfinite(rows).all():
             rows = converted(rows, self._settings.actions, self._action)

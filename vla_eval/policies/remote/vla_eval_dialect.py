@@ -27,6 +27,8 @@ EPISODE_START, EPISODE_END = "episode_start", "episode_end"
 class VlaEvalClient:
     """A session on such a server."""
 
+    shares_connection = False
+
     def __init__(self, connection: Connection, settings: RemoteSettings) -> None:
         """Greet the server, which has to greet back in this version."""
         self._connection = connection
@@ -42,20 +44,10 @@ class VlaEvalClient:
                     f"expected version {PROTOCOL_VERSION} of the protocol of vla-eval, found {shown(version)}"
                 )
             name = said.get("model_server")
-            self._metadata = ServerMetadata(name=name if isinstance(name, str) and name else None, other=said)
+            self.metadata = ServerMetadata(name=name if isinstance(name, str) and name else None, other=said)
         except BaseException:
             connection.close()
             raise
-
-    @property
-    def metadata(self) -> ServerMetadata:
-        """The metadata in the server's greeting."""
-        return self._metadata
-
-    @property
-    def shares_connection(self) -> bool:
-        """Never: a session is a connection."""
-        return False
 
     def ask_reset(self, session: str, start: EpisodeStart) -> None:
         """End the former episode and begin another; the server does not answer."""
