@@ -12,8 +12,7 @@ from tests.evaluation.evaluation_bench import bench as bench
 from tests.evaluation.resolved import evaluate, evaluation_effort
 from tests.wire.small_servers import SmallServer, serving
 from vla_eval.cli.main import main
-from vla_eval.config.capture import CaptureConfig
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import CaptureConfig, EvalConfig
 from vla_eval.errors import VlaEvalError
 from vla_eval.evaluation import evaluate as evaluating
 from vla_eval.evaluation.dry_run import AssumedRates

@@ -14,9 +14,8 @@ from rerun.experimental import RrdReader
 from tests.evaluation.resolved import evaluate, fingerprint
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
-from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import CaptureConfig, EvalConfig, is_wanted, may_be_wanted
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, VlaEvalError

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.viz.test_capture import CAMERAS, SHORT, TASK, play
-from vla_eval.config.capture import CaptureConfig
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
+from vla_eval.config.evaluation import CaptureConfig
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import ViewingError
 from vla_eval.testing.claims import same_observation

@@ -144,11 +144,8 @@ def _check_disk(base: Base, parts: list[RemotePart], downloads: Path, say: Say) 
     n_free = shutil.disk_usage(existing).free
     for part in parts:
         stated = part.licence or "none stated"
-        pinned = (
-            ""
-            if part.source.revision == part.commit
-            else f" (asked for: {part.source.revision or 'the newest'})"
-        )
+        asked = part.source.revision or "the newest"
+        pinned = "" if asked == part.commit else f" (asked for: {asked})"
         say(f"{part.source.repo_id} at {part.commit}{pinned}; licence on the Hub: {stated}")
     say(f"{base.title}: {base.terms}")
     say(f"disk: {n_needed / GB:.2f} GB needed, {n_free / GB:.2f} GB free")

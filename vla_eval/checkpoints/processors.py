@@ -33,18 +33,14 @@ def load_processors(folder: Path, config: Any, *, tokenizer: str | None) -> tupl
     register_steps(type(config))
     files = (PREPROCESSOR_FILE, POSTPROCESSOR_FILE)
     before, after = (read_saved_processor(folder / name).names() for name in files)
-    overrides: dict[str, dict[str, Any]] = {}
-    if "device_processor" in before:
-        overrides["device_processor"] = {"device": config.device}
-    if "normalizer_processor" in before:
-        overrides["normalizer_processor"] = {"device": config.device}
+    here: dict[str, Any] = {"device": config.device}
+    devices = ("device_processor", "normalizer_processor")
+    overrides: dict[str, Any] = {name: here for name in devices if name in before}
     if tokenizer is not None and TOKENIZER_STEP not in before:
         raise CheckpointError(f"{folder}: `tokenizer` is given, but this policy's preprocessor has none.")
     overrides.update(tokenizer_overrides(folder, config, before, tokenizer=tokenizer))
     # The postprocessor ends with a step of the same name that brings actions to the CPU: left alone.
-    after_overrides = (
-        {"unnormalizer_processor": {"device": config.device}} if "unnormalizer_processor" in after else {}
-    )
+    after_overrides = {name: here for name in ("unnormalizer_processor",) if name in after}
     try:
         with only_data(), processors_through_the_door():
             return make_pre_post_processors(  # type: ignore[no-any-return]

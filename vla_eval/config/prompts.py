@@ -46,11 +46,6 @@ def load_prompts(prompt_set: str = DEFAULT_PROMPT_SET) -> Recipe[PromptRecipe]:
     return load_recipe("prompts", prompt_set, PromptRecipe)
 
 
-def instructions_for(spec: Instructed, prompt_set: str = DEFAULT_PROMPT_SET) -> tuple[str, ...]:
-    """Return the sentence of a task and then its paraphrases; errors as `load_prompts` and `sentences_of`."""
-    return sentences_of(load_prompts(prompt_set), spec)
-
-
 def sentences_of(prompts: Recipe[PromptRecipe], spec: Instructed) -> tuple[str, ...]:
     """Return a task's sentences in a set: the sentence, then its paraphrases; else the task's own sentence.
 
@@ -71,5 +66,5 @@ def sentences_of(prompts: Recipe[PromptRecipe], spec: Instructed) -> tuple[str, 
 
 
 def instruction_for(spec: Instructed, prompt_set: str = DEFAULT_PROMPT_SET) -> str:
-    """Return the sentence of a task, word for word as the set has it; errors as `instructions_for`."""
-    return instructions_for(spec, prompt_set)[0]
+    """Return the sentence of a task, word for word as the set has it; errors as of these two."""
+    return sentences_of(load_prompts(prompt_set), spec)[0]

@@ -8,8 +8,7 @@ from typing import Literal
 
 from vla_eval.checkpoints.files import find_checkpoint, weights_file
 from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
-from vla_eval.config.capture import may_be_wanted
-from vla_eval.config.evaluation import EvalConfig
+from vla_eval.config.evaluation import EvalConfig, may_be_wanted
 from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.evaluation.evaluate import describe, worker_count
 from vla_eval.evaluation.job_queue import JobQueue

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # lerobot is untyped
 
+import torch
+
 from vla_eval.checkpoints.bases import how_to_get
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.checkpoints.loading import NO_DOWNLOADS, config_class
@@ -131,6 +133,4 @@ def _base_folder(recipe: FinetuneRecipe) -> Path | None:
 
 
 def _memory_here() -> float | None:
-    import torch
-
     return float(torch.cuda.get_device_properties(0).total_memory) if torch.cuda.is_available() else None

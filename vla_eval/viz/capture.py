@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from vla_eval.config.capture import CaptureConfig, is_wanted, may_be_wanted
+from vla_eval.config.evaluation import CaptureConfig, is_wanted, may_be_wanted
 from vla_eval.core import EpisodeStart, Stage
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import EnvSpec

@@ -26,11 +26,10 @@ from vla_eval.errors import CheckpointError
 from vla_eval.models.spatialvla.conversion import EMBEDDINGS, HEAD
 from vla_eval.models.spatialvla.conversion_options import SpatialVLAOptions
 from vla_eval.models.spatialvla.depth import PAD_PX
-from vla_eval.models.spatialvla.described import _NOT_OF_ENCODER, _NOT_OF_ZOE, check_described
+from vla_eval.models.spatialvla.described import _NOT_OF_ENCODER, _NOT_OF_ZOE, OF_NO_EFFECT, check_described
 from vla_eval.models.spatialvla.ego3d import CENTRE_M
 from vla_eval.models.spatialvla.generation import from_tokens
 from vla_eval.models.spatialvla.network import FIRST_PLACE
-from vla_eval.models.spatialvla.sections import OF_NO_EFFECT
 from vla_eval.models.spatialvla.sizes import TOKENS_PER_ACTION, NetworkSizes
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.training.dataset import training_dataset

@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from vla_eval.cli.terminal.episode_bar import EpisodeBar
 from vla_eval.cli.terminal.json_progress import EvaluationLines, JsonLines, PhaseLines
-from vla_eval.config.capture import CaptureConfig
+from vla_eval.config.evaluation import CaptureConfig
 from vla_eval.evaluation.evaluate import EvaluationObserver, EvaluationSummary, evaluate
 from vla_eval.evaluation.plan import Plan
 from vla_eval.evaluation.resolve import ResolvedEvaluation

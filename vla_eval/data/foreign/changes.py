@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 from PIL import Image
 
-from vla_eval.config.prompts import instruction_for, instructions_for
+from vla_eval.config.prompts import instruction_for, load_prompts, sentences_of
 from vla_eval.control_modes import ABSOLUTE_MODES
 from vla_eval.core import ImageArray
 from vla_eval.data.checks.demonstrated import Demonstrations, Numbers
@@ -76,7 +76,7 @@ def other_sentences(what: Demonstrations, task: TaskSpec | None) -> tuple[str, .
     """Return a sentence if the instructions are not those with which the task is evaluated."""
     if task is None:
         return ()
-    known = instructions_for(task)
+    known = sentences_of(load_prompts(), task)
     other = sorted({sentence for sentence in what.sentences if sentence and sentence not in known})
     if not other:
         return ()

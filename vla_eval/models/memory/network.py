@@ -127,7 +127,9 @@ class MemoryNetwork(nn.Module):
 
     def write(self, sight: Sight, shape: Sequence[int], memory: Memory) -> Memory:
         """Return the memories (B, T, …) after each of B · T steps, episode by episode; `shape` is (B, T)."""
-        return self._written(by_episode(sight.things, shape), by_episode(sight.summary, shape), memory)
+        seen = (sight.things, sight.summary)
+        things, summaries = (part.reshape(*shape, *part.shape[1:]) for part in seen)
+        return self._written(things, summaries, memory)
 
     @in_float32
     def _written(self, things: Tensor, summaries: Tensor, memory: Memory) -> Memory:
@@ -220,8 +222,3 @@ def _of(sight: Sight, steps: Tensor) -> Sight:
         sight.things[steps],
         sight.summary[steps],
     )
-
-
-def by_episode(steps: Tensor, shape: Sequence[int]) -> Tensor:
-    """Return (B · T, …) as (B, T, …), `shape` being (B, T)."""
-    return steps.reshape(*shape, *steps.shape[1:])
