@@ -45,35 +45,24 @@ NOT_HASHED = frozenset({"train_config.json", "README.md", ".gitattributes", BASE
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingFacts:
-    """What a policy saw in training, kept beside its weights and compared before an evaluation.
-
-    Attributes:
-        dataset, dataset_sha256: which demonstrations; the digest names their content.
-        task: the task of the demonstrations; empty if they are of several, or of none that is known.
-        state: which proprioception `observation.state` was: `eef` or `joints`.
-        images: image fields of the dataset, in the policy's order -> (height_px, width_px).
-        seeds: task -> the seeds whose demonstrations these are; None if not known: another program's seed is
-            another episode, and earlier versions did not note them.
-        tasks: all tasks of the demonstrations; empty where they are not known.
-        sentences: task, empty if not known -> the sentences of its demonstrations; None: not noted, as by
-            earlier versions.
-        gripper_open: the gripper's number that opens it; None: not noted.
-    """
+    """What a policy saw in training, kept beside its weights and compared before an evaluation."""
 
     run: str
     dataset: str
-    dataset_sha256: str
-    task: str
-    state: str
-    images: dict[str, tuple[int, ...]]
+    dataset_sha256: str  # of its content
+    task: str  # empty if the demonstrations are of several tasks, or of none that is known
+    state: str  # which proprioception `observation.state` was: `eef` or `joints`
+    images: dict[str, tuple[int, ...]]  # field, in the policy's order -> (height_px, width_px)
     fps: float
     action_names: tuple[str, ...]
     control_mode: str
     run_seed: int
+    # by task; None: not known (another program's seed is another episode) or, by earlier versions, not noted
     seeds: dict[str, tuple[SeedRange, ...]] | None = None
-    tasks: tuple[str, ...] = ()
+    tasks: tuple[str, ...] = ()  # all of them; empty where they are not known
+    # by task, empty if not known; None: not noted, as by earlier versions
     sentences: dict[str, tuple[str, ...]] | None = None
-    gripper_open: float | None = None
+    gripper_open: float | None = None  # the gripper's number that opens it; None: not noted
 
 
 def find_checkpoint(path: Path) -> Path:

@@ -18,17 +18,13 @@ WristMesh = Literal["shipped", "whole", "simplified"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RenderSettings:
-    """How images are rendered.
+    """How images are rendered."""
 
-    Attributes:
-        wrist_mesh: the mesh of the wrist camera's housing: `shipped` gives the images of ManiSkill's own
-            mesh and leaves out what is hidden inside the housing; `whole` draws that, too (the same images,
-            slower); `simplified` renders a little faster on a CPU and looks a little different.
-        backend: `auto`, `cpu`, `gpu`, or a device as SAPIEN names it (`cuda:1`).
-    """
-
+    # the mesh of the wrist camera's housing: `shipped` gives the images of ManiSkill's own mesh and leaves
+    # out what is hidden inside the housing; `whole` draws that, too (the same images, slower); `simplified`
+    # renders a little faster on a CPU and looks a little different
     wrist_mesh: WristMesh = "shipped"
-    backend: str = "auto"
+    backend: str = "auto"  # `auto`, `cpu`, `gpu`, or a device as SAPIEN names it (`cuda:1`)
 
     def __post_init__(self) -> None:
         check_device(self.backend, name="render.backend", renders=True)
@@ -60,29 +56,20 @@ AS_DESIGNED = AppearanceSettings()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvSettings:
-    """One environment object; two equal settings give interchangeable environments.
+    """One environment object; two equal settings give interchangeable environments."""
 
-    Attributes:
-        task: task id from the catalogue.
-        kwargs: the user's task arguments; they go on top of the catalogue row's own.
-        simulator: `maniskill`, or `fake` (arrays only, for tests and dry runs).
-        cameras: the cameras that may be rendered; empty: no renderer is started.
-        privileged: whether observations carry the true state of the world.
-        human_camera_stride: every so many control steps, and at the reset, images include `human_camera`,
-            a view for people; None: never.
-        n_slots: how many episodes run side by side.
-    """
-
-    task: str
-    kwargs: Mapping[str, Any] = field(default_factory=dict)  # Any: whatever the task's arguments are
-    simulator: Simulator = "maniskill"
+    task: str  # its id
+    # the user's task arguments, of whatever types; they go on top of the catalogue row's own
+    kwargs: Mapping[str, Any] = field(default_factory=dict)
+    simulator: Simulator = "maniskill"  # or `fake`: arrays only, for tests and dry runs
     sim_backend: SimBackend = "cpu"
     render: RenderSettings = field(default_factory=RenderSettings)
     appearance: AppearanceSettings = AS_DESIGNED
-    cameras: tuple[str, ...] = ()
-    privileged: bool = False
+    cameras: tuple[str, ...] = ()  # those that may be rendered; empty: no renderer is started
+    privileged: bool = False  # whether observations carry the true state of the world
+    # at the reset and every so many control steps, images include the view for people; None: never
     human_camera_stride: int | None = None
-    n_slots: int = 1
+    n_slots: int = 1  # how many episodes run side by side
 
     def shows_human_camera(self, step: int, horizon_steps: int) -> bool:
         """Whether the images of a step include the view for people."""

@@ -85,17 +85,11 @@ class TimeoutConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ProbedWorld:
-    """Which world of a probe an evaluation is; `mikasa-vla probe` states it in `run.json`.
+    """Which world of a probe an evaluation is; `mikasa-vla probe` states it in `run.json`."""
 
-    Attributes:
-        change: what is changed, `none` for nothing; in a grid, the phase whose length is changed.
-        level: by how much: a number, or a name; None where there is nothing to count.
-        first_inference_step: in a grid, the step of the first inference; None: not of a grid.
-    """
-
-    change: str
-    level: int | str | None = None
-    first_inference_step: int | None = None
+    change: str  # what is changed, `none` for nothing; in a grid, the phase whose length is changed
+    level: int | str | None = None  # by how much: a number, or a name; None where nothing is counted
+    first_inference_step: int | None = None  # in a grid; None: not of a grid
 
     def __post_init__(self) -> None:
         in_grid = self.first_inference_step is not None

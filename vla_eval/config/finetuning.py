@@ -113,25 +113,18 @@ class HeldOutConfig:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FinetuneConfig:
-    """One fine-tuning, as `mikasa-vla finetune CONFIG` reads it.
+    """One fine-tuning, as `mikasa-vla finetune CONFIG` reads it."""
 
-    Attributes:
-        policy: name of a recipe in `policies/` that has a `finetune` section.
-        out: the run folder; None: `runs/POLICY-DATASET-SEED`.
-        run_seed: of initial weights, order of samples and noise.
-        finetune: fields of the recipe's `finetune` section, set to other values.
-        held_out: evaluate checkpoints on held-out seeds during training; None: do not.
-        allow_unreplayed: train on a dataset that no replay has confirmed; noted in the run.
-    """
-
-    policy: str
+    policy: str  # name of a recipe in `policies/` that has a `finetune` section
     dataset: str
-    out: str | None = None
-    run_seed: int = 0
-    finetune: dict[str, Any] = field(default_factory=dict)  # Any: decoded as a FinetuneRecipe
+    out: str | None = None  # the run folder; None: `runs/POLICY-DATASET-SEED`
+    run_seed: int = 0  # of initial weights, order of samples and noise
+    # fields of the recipe's `finetune` section, set to other values; Any: decoded as a FinetuneRecipe
+    finetune: dict[str, Any] = field(default_factory=dict)
     device: str = "auto"
+    # None: no checkpoint is evaluated during training
     held_out: HeldOutConfig | None = field(default=None, metadata=formerly("evaluation"))
-    allow_unreplayed: bool = False
+    allow_unreplayed: bool = False  # train on a dataset that no replay has confirmed; noted in the run
 
     def __post_init__(self) -> None:
         check_seeds(self.run_seed, name="run_seed")

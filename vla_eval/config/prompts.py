@@ -11,18 +11,12 @@ DEFAULT_PROMPT_SET = "paper"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PromptRecipe:
-    """`prompts/*.yaml`: the instructions of the tasks, under one name.
+    """`prompts/*.yaml`: the instructions of the tasks, under one name."""
 
-    Attributes:
-        version: raised when a sentence changes.
-        source: where the sentences come from.
-        instructions: instruction key of a task -> its sentence, then paraphrases of it.
-    """
-
-    version: int
+    version: int  # raised when a sentence changes
     description: str
-    source: str
-    instructions: dict[str, tuple[str, ...]]
+    source: str  # where the sentences come from
+    instructions: dict[str, tuple[str, ...]]  # a task's key -> its sentence, then paraphrases of it
 
 
 class Instructed(Protocol):

@@ -9,21 +9,13 @@ from vla_eval.specs import EnvSpec
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Compilation:
-    """What a warm-up found out.
+    """What a warm-up found out."""
 
-    Attributes:
-        seconds: it took, compilation included.
-        n_rows: of a pass.
-        precision: of most weights.
-        difference: the largest |compiled - not compiled| of an action, in the action's units.
-        scale: the largest |action|.
-    """
-
-    seconds: float
-    n_rows: int
-    precision: str
-    difference: float
-    scale: float
+    seconds: float  # it took, compilation included
+    n_rows: int  # of a pass
+    precision: str  # of most weights
+    difference: float  # the largest |compiled - not compiled| of an action, in the action's units
+    scale: float  # the largest |action|
 
     def note(self, policy: str) -> str:
         """Return the line that tables print."""

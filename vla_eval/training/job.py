@@ -34,32 +34,23 @@ from vla_eval.training.run_folder import TRAIN_FOLDER
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingJob:
-    """One fine-tuning.
-
-    Attributes:
-        recipe: the section `finetune` of the policy's recipe, with the configuration's values on top.
-        policy: lerobot's configuration of the policy, which it completes when the model is made.
-        frames: how many of the dataset's frames begin a chunk.
-        base: folder of the weights to start from; None: from scratch.
-        below: what those were trained on; None: from scratch, or not known.
-        resume_from: folder of the checkpoint (`…/000100`) to resume from; None: from the beginning.
-        run_id: names the run to services, also when it is resumed; None: it has no folder yet.
-    """
+    """One fine-tuning."""
 
     name: str
     recipe_sha256: str
-    recipe: FinetuneRecipe
+    recipe: FinetuneRecipe  # with the configuration's values on top
     dataset: OpenDataset
-    policy: Any
+    policy: Any  # lerobot's configuration, which it completes when the model is made
     frames: UsedFrames
-    base: Path | None
-    below: TrainingFacts | None
+    base: Path | None  # folder of the weights to start from; None: from scratch
+    below: TrainingFacts | None  # what those were trained on; None: from scratch, or not known
     device: str
     out: Path
     run_seed: int
     held_out: HeldOutConfig | None
     held_out_task: str | None
-    resume_from: Path | None = None
+    resume_from: Path | None = None  # folder of the checkpoint (`…/000100`); None: from the beginning
+    # names the run to services, also when it is resumed; None: it has no folder yet
     run_id: str | None = None
 
     @property

@@ -35,31 +35,23 @@ TRAINED: dict[Trained, tuple[str, ...]] = {
 class MikasaOctoConfig(PortedConfig):
     """Octo, Octo Model Team 2024 (arXiv:2405.12213).
 
-    Attributes:
-        cameras: camera of the model (`primary`, `wrist`) -> field of the dataset.
-        image_px: camera of the model -> edge that its images are resized to.
-        window: frames that it sees, the newest included; what lies before the episode is masked.
-        max_window: longest window that there are position embeddings for.
-        trained: which parameters are trained, see `TRAINED`.
-        remember_readouts: compute the frozen trunk's output for each training frame once; needs
-            `trained: heads` and no augmentation. Another recipe than the paper's, see `docs/octo.md`.
-        width, …: see `TransformerSizes`, `HeadSizes`, `T5Sizes`, `Augmentation`, `Gripper`.
-        language_tokens: tokens of an instruction; longer ones are cut, as in the original.
-        primary_crop_area: only the first camera is cropped, and in evaluation its middle is taken.
-        normalize_gripper: whether the gripper is normalised, too; the original leaves it alone.
-        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
-            scheduler_decay_steps: AdamW (decay on `flax_names.is_kernel` alone), warm-up, cosine to 0.
+    For the sizes, see `TransformerSizes`, `HeadSizes`, `T5Sizes`; for the rest, `Augmentation` and `Gripper`.
+    AdamW decays `flax_names.is_kernel` alone; after the warm-up its learning rate is a cosine to 0.
     """
 
+    # camera of the model -> field of the dataset
     cameras: dict[str, str] = field(
         default_factory=lambda: {"primary": "observation.images.base", "wrist": "observation.images.wrist"}
     )
+    # camera of the model -> edge that its images are resized to
     image_px: dict[str, int] = field(default_factory=lambda: {"primary": 256, "wrist": 128})
-    window: int = 10
-    max_window: int = 10
+    window: int = 10  # frames that it sees, the newest included; what lies before the episode is masked
+    max_window: int = 10  # longest window that there are position embeddings for
     chunk_size: int = 4
     n_action_steps: int = 4
-    trained: Trained = "heads"
+    trained: Trained = "heads"  # which parameters, see `TRAINED`
+    # compute the frozen trunk's output for each training frame once; needs `trained: heads` and no
+    # augmentation. Another recipe than the paper's, see `docs/octo.md`.
     remember_readouts: bool = False
 
     width: int = 384
@@ -74,12 +66,13 @@ class MikasaOctoConfig(PortedConfig):
     diffusion_steps: int = 20
     max_action: float = 5.0
 
-    language_tokens: int = 16
-    t5: dict[str, int] = field(default_factory=dict)
-    tokenizer_name: str = "google-t5/t5-base"
+    language_tokens: int = 16  # of an instruction; longer ones are cut, as in the original
+    t5: dict[str, int] = field(default_factory=dict)  # what is not named is t5-base's
+    tokenizer_name: str = "google-t5/t5-base"  # folder or name, or `bytes`
 
     # Source: scripts/configs/finetune_config.py of the original, workspace and wrist augmentation.
     augment: bool = True
+    # only the first camera is cropped, and in evaluation its middle is taken
     primary_crop_area: tuple[float, float] | None = (0.8, 1.0)
     primary_crop_ratio: tuple[float, float] = (0.9, 1.1)
     brightness: float = 0.1
@@ -89,7 +82,7 @@ class MikasaOctoConfig(PortedConfig):
 
     gripper_encoding: GripperEncoding = "maniskill"
     gripper_decoding: GripperDecoding = "continuous"
-    normalize_gripper: bool = False
+    normalize_gripper: bool = False  # the original leaves it alone
 
     # Source: the same file.
     optimizer_lr: float = 3e-4

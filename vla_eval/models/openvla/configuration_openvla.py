@@ -76,29 +76,22 @@ class StepDecaySchedulerConfig(LRSchedulerConfig):  # type: ignore[misc]  # lero
 class MikasaOpenVLAConfig(PromptedConfig):
     """OpenVLA, or OpenVLA-OFT, as one type; `head` says which.
 
-    Attributes:
-        head: see `NetworkOptions`.
-        chunk_size: a part of the model: K = 4 and K = 8 are two trainings.
-        pictures: empty: all images of the dataset.
-        use_proprio: read `observation.state` as one more token. The paper does not.
-        dtype: of vision encoders, projector and Llama. The continuous head is always float32.
-        image_augmentation: change training images at random and crop those of an evaluation alike.
-        do_mask_loss_for_padding: False, as the original: no chunk begins so late that it goes beyond the end.
-        optimizer_lr, optimizer_weight_decay, optimizer_grad_clip_norm, scheduler_warmup_steps,
-            scheduler_decay_steps: AdamW, constant, divided by ten after `scheduler_decay_steps` (0: never).
+    It reads all images unless `pictures` names some. `dtype` is that of vision encoders, projector and Llama;
+    the continuous head is always float32. As in the original, no chunk begins so late that it goes beyond the
+    end of an episode, and AdamW's learning rate is constant but for one division by ten.
     """
 
     sizes_class = NetworkSizes
 
-    head: str = "l1"
-    chunk_size: int = 8
+    head: str = "l1"  # see `NetworkOptions`
+    chunk_size: int = 8  # a part of the model: K = 4 and K = 8 are two trainings
     n_action_steps: int = 8
-    use_proprio: bool = False
-    image_augmentation: bool = True
+    use_proprio: bool = False  # read `observation.state` as one more token. The paper does not.
+    image_augmentation: bool = True  # change training images at random, crop those of an evaluation alike
     tokenizer_name: str = "openvla/openvla-7b"
 
     optimizer_grad_clip_norm: float = 0.0
-    scheduler_decay_steps: int = 100_000
+    scheduler_decay_steps: int = 100_000  # 0: never
 
     def __post_init__(self) -> None:
         super().__post_init__()
