@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any  # JSON of another program
 
 from vla_eval.checkpoints.files import CONFIG_FILE, read_json
@@ -22,23 +21,21 @@ class Answer:
     off: bool | None = None  # its value that asks for nothing, which the policy is built with
 
 
-EXECUTION_FIELDS: Mapping[str, Answer] = MappingProxyType(
-    {
-        "n_action_steps": Answer(translated="the default of --n-action-steps"),
-        "n_obs_steps": Answer(translated="the frames that an inference gets"),
-        "temporal_ensemble_coeff": Answer(
-            instead="chunks are executed as the evaluation says. The same is --n-action-steps 1 --set "
-            "chunking.mode=temporal_ensemble --set chunking.ensemble_decay={value}"
-        ),
-        "rtc_config": Answer(instead=RTC),
-        "rtc_ramp_rate": Answer(instead=RTC),
-        "per_episode_seed": Answer(instead=DRAWS, off=False),
-        "eval_seed": Answer(instead=DRAWS),
-        "compile_model": Answer(
-            instead="the network is computed as it is. Compiled: --set compile=true", off=False
-        ),
-    }
-)
+EXECUTION_FIELDS: Mapping[str, Answer] = {
+    "n_action_steps": Answer(translated="the default of --n-action-steps"),
+    "n_obs_steps": Answer(translated="the frames that an inference gets"),
+    "temporal_ensemble_coeff": Answer(
+        instead="chunks are executed as the evaluation says. The same is --n-action-steps 1 --set "
+        "chunking.mode=temporal_ensemble --set chunking.ensemble_decay={value}"
+    ),
+    "rtc_config": Answer(instead=RTC),
+    "rtc_ramp_rate": Answer(instead=RTC),
+    "per_episode_seed": Answer(instead=DRAWS, off=False),
+    "eval_seed": Answer(instead=DRAWS),
+    "compile_model": Answer(
+        instead="the network is computed as it is. Compiled: --set compile=true", off=False
+    ),
+}
 """Field -> how it is answered."""
 
 

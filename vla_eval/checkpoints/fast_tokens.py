@@ -75,12 +75,11 @@ def load_fast_tokenizer(name: str) -> FastActionTokenizer:
 
 def _vocabulary(name: str) -> Any:
     """Return the byte-pair encoding, which lies beside the settings, or in `VOCABULARY_FOLDER`."""
-    tokenizer: Any = PreTrainedTokenizerFast
     try:
-        return tokenizer.from_pretrained(name)
+        return PreTrainedTokenizerFast.from_pretrained(name)
     except (OSError, ValueError) as beside:
         try:
-            return tokenizer.from_pretrained(name, subfolder=VOCABULARY_FOLDER)
+            return PreTrainedTokenizerFast.from_pretrained(name, subfolder=VOCABULARY_FOLDER)
         except (OSError, ValueError):
             raise beside from None
 

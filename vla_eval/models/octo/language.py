@@ -33,8 +33,7 @@ def make_text_encoder(sizes: T5Sizes) -> Any:
     """Return transformers' encoder with random weights, frozen and without dropout."""
     from transformers import T5Config, T5EncoderModel
 
-    make_config: Any = T5Config
-    config = make_config(
+    config = T5Config(
         vocab_size=sizes.vocabulary,
         d_model=sizes.width,
         d_kv=sizes.key,
@@ -47,8 +46,7 @@ def make_text_encoder(sizes: T5Sizes) -> Any:
         layer_norm_epsilon=1e-6,
         dropout_rate=0.0,
     )
-    make: Any = T5EncoderModel
-    return make(config).eval().requires_grad_(False)
+    return T5EncoderModel(config).eval().requires_grad_(False)
 
 
 class PromptEmbeddings:

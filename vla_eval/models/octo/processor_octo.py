@@ -28,5 +28,4 @@ def make_mikasa_octo_pre_post_processors(
 def _bytes_tokenizer() -> Any:
     from transformers import ByT5Tokenizer
 
-    make: Any = ByT5Tokenizer
-    return make(extra_ids=0)
+    return ByT5Tokenizer(extra_ids=0)

@@ -53,8 +53,7 @@ class OpenVLANetwork(nn.Module):
         self.sizes, self.options = sizes, options
         self.vision = FusedVision(sizes)
         self.projector = Projector(sizes)
-        make_llm: Any = LlamaForCausalLM
-        self.llm: Any = make_llm(_llama_config(sizes))
+        self.llm: Any = LlamaForCausalLM(_llama_config(sizes))
         if options.proprio:
             self.proprio_projector = ProprioProjector(proprio=options.proprio, llm_width=sizes.llm_width)
         if options.head == "l1":
@@ -159,8 +158,7 @@ def finished(ids: Tensor, mask: Tensor, sizes: NetworkSizes) -> Prompts:
 
 
 def _llama_config(sizes: NetworkSizes) -> Any:
-    config: Any = LlamaConfig
-    return config(
+    return LlamaConfig(
         vocab_size=sizes.vocabulary,
         hidden_size=sizes.llm_width,
         intermediate_size=sizes.llm_mlp,

@@ -71,9 +71,8 @@ class Projector(nn.Module):
 
 
 def _dino(sizes: NetworkSizes) -> Any:
-    config: Any = Dinov2WithRegistersConfig
     model: Any = Dinov2WithRegistersModel(
-        config(
+        Dinov2WithRegistersConfig(
             hidden_size=sizes.dino_width,
             num_hidden_layers=sizes.dino_depth - 1,
             num_attention_heads=sizes.dino_heads,

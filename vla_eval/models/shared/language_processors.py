@@ -104,7 +104,6 @@ def byte_tokenizer() -> Any:
     tokenizer.post_processor = processors.TemplateProcessing(
         single=f"{bos} $A", special_tokens=[(bos, vocabulary[bos])]
     )
-    make_fast: Any = PreTrainedTokenizerFast
-    return make_fast(
+    return PreTrainedTokenizerFast(
         tokenizer_object=tokenizer, pad_token=pad, bos_token=bos, eos_token=eos, padding_side="right"
     )

@@ -11,9 +11,8 @@ LAYER_NORM_EPS = 1e-6
 
 def siglip(sizes: VisionSizes, *, n_blocks: int, activation: str) -> Any:
     """Return the encoder of that depth with random weights, without its pooling head."""
-    config: Any = SiglipVisionConfig
     model: Any = SiglipVisionModel(
-        config(
+        SiglipVisionConfig(
             hidden_size=sizes.siglip_width,
             intermediate_size=sizes.siglip_mlp,
             num_hidden_layers=n_blocks,

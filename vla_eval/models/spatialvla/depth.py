@@ -81,14 +81,12 @@ def cut_depth(depth: Tensor, image_px: int) -> Tensor:
 
 def zoe_depth(sizes: NetworkSizes) -> Any:
     """Return transformers' ZoeDepth with random weights."""
-    model: Any = ZoeDepthForDepthEstimation
-    return model(zoe_config(sizes))
+    return ZoeDepthForDepthEstimation(zoe_config(sizes))
 
 
 def zoe_config(sizes: NetworkSizes) -> Any:
     """Return transformers' configuration of it."""
-    make_encoder: Any = BeitConfig
-    encoder = make_encoder(
+    encoder = BeitConfig(
         image_size=sizes.depth_px,
         hidden_size=sizes.depth_width,
         num_hidden_layers=sizes.depth_layers,
@@ -98,8 +96,7 @@ def zoe_config(sizes: NetworkSizes) -> Any:
         reshape_hidden_states=False,
         out_features=[f"stage{sizes.depth_layers * quarter // 4}" for quarter in (1, 2, 3, 4)],
     )
-    make: Any = ZoeDepthConfig
-    return make(
+    return ZoeDepthConfig(
         backbone_config=encoder,
         neck_hidden_sizes=[sizes.depth_neck // share for share in NECK_SHARES],
         fusion_hidden_size=sizes.depth_fusion,

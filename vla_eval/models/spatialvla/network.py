@@ -62,8 +62,7 @@ class SpatialVLANetwork(nn.Module):
         self.vision = siglip(sizes, n_blocks=sizes.siglip_depth, activation=GELU)
         self.position_embedding_3d = Ego3DEncoding(sizes)
         self.projector = nn.Linear(sizes.siglip_width, sizes.llm_width)
-        make_llm: Any = Gemma2Model
-        self.llm: Any = make_llm(_gemma_config(sizes))
+        self.llm: Any = Gemma2Model(_gemma_config(sizes))
         self.spatial_embed_tokens = nn.Embedding(sizes.n_action_tokens, sizes.llm_width)
         nn.init.normal_(self.spatial_embed_tokens.weight, std=0.02)  # as transformers begins its own
         if sizes.llm_own_head:
@@ -182,8 +181,7 @@ def finished(ids: Tensor, mask: Tensor, sizes: NetworkSizes) -> Prompts:
 
 
 def _gemma_config(sizes: NetworkSizes) -> Any:
-    config: Any = Gemma2Config
-    return config(
+    return Gemma2Config(
         vocab_size=sizes.vocabulary,
         hidden_size=sizes.llm_width,
         intermediate_size=sizes.llm_mlp,

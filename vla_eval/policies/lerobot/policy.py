@@ -55,9 +55,6 @@ class LeRobotPolicy:
     """`Policy` around a loaded LeRobot policy; see the module's text.
 
     Args:
-        name: for messages.
-        loaded: policy and processors.
-        inputs: how observations become inputs.
         batch: infer for all due slots in one forward pass; None: if there are several slots and the
             policy can. Sums are then made in another order, so that actions agree with those of a pass
             of its own only up to rounding.
