@@ -17,7 +17,6 @@ from vla_eval.errors import SpecMismatchError, did_you_mean
 from vla_eval.features import STATE_KEY, STATE_NAMES, StateKind, proprioception
 from vla_eval.specs import EnvSpec
 
-ACTION_KEY = "action"
 MAX_UNIT = 1.0 + 1e-3  # statistics of images in [0, 1]; those of 0 … 255 are far beyond
 MAX_FOV_DIFFERENCE_RAD = 1e-4
 

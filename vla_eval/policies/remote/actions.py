@@ -9,7 +9,6 @@ from vla_eval.core import FloatArray
 from vla_eval.policies.remote.settings import ActionSettings
 from vla_eval.specs import ActionSpec
 
-DELTA_POSE = "pd_ee_delta_pose"
 N_DELTA_POSE = 7  # three of position, three of rotation, the gripper
 POSITION_UNIT_M = 0.1
 ROTATION_UNIT_RAD = -0.1

@@ -7,9 +7,10 @@ from typing import Any, Literal  # Any: a request holds arrays and text
 import numpy as np
 from PIL import Image
 
+from vla_eval.control_modes import EE_DELTA_POSE
 from vla_eval.core import ImageArray, Observation
 from vla_eval.errors import SimulationError, SpecMismatchError, did_you_mean, some_of
-from vla_eval.policies.remote.actions import DELTA_POSE, N_DELTA_POSE
+from vla_eval.policies.remote.actions import N_DELTA_POSE
 from vla_eval.policies.remote.settings import CameraSettings, RemoteSettings
 from vla_eval.policies.remote.state_layouts import StateLayout, layout_names, state_layout
 from vla_eval.specs import EnvSpec
@@ -110,10 +111,10 @@ def _check_actions(settings: RemoteSettings, server: ServerMetadata, env: EnvSpe
             f"{where}: the server's policy acts at {server.control_hz:g} Hz, {env.task} at "
             f"{env.control_hz:g} Hz. Serve a policy that was trained for these tasks."
         )
-    is_delta_pose = action.control_mode == DELTA_POSE and len(action.dims) == N_DELTA_POSE
+    is_delta_pose = action.control_mode == EE_DELTA_POSE and len(action.dims) == N_DELTA_POSE
     if settings.actions is not None and not is_delta_pose:
         raise SpecMismatchError(
-            f"{where}: `actions` in the recipe converts to {DELTA_POSE} with {N_DELTA_POSE} numbers; "
+            f"{where}: `actions` in the recipe converts to {EE_DELTA_POSE} with {N_DELTA_POSE} numbers; "
             f"{env.task} has {action.control_mode} with {len(action.dims)}."
         )
 
