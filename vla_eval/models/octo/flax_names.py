@@ -49,34 +49,28 @@ def _heads_in(x: Tensor) -> Tensor:
     return x.flatten(0, 1).T  # (heads, head, out) -> (out, heads × head)
 
 
-def _linear(pattern: str, name: str) -> list[_Rule]:
-    return [
-        _Rule(pattern + r"\.kernel", f"{name}.weight", _dense),
-        _Rule(pattern + r"\.bias", f"{name}.bias", _same),
-    ]
+def _kernel(pattern: str, name: str, change: Callable[[Tensor], Tensor] = _dense) -> list[_Rule]:
+    weight = _Rule(pattern + r"\.kernel", f"{name}.weight", change)
+    return [weight, _Rule(pattern + r"\.bias", f"{name}.bias", _same)]
 
 
 def _norm(pattern: str, name: str) -> list[_Rule]:
-    return [
-        _Rule(pattern + r"\.scale", f"{name}.weight", _same),
-        _Rule(pattern + r"\.bias", f"{name}.bias", _same),
-    ]
+    weight = _Rule(pattern + r"\.scale", f"{name}.weight", _same)
+    return [weight, _Rule(pattern + r"\.bias", f"{name}.bias", _same)]
 
 
 _BLOCKS = r"network.transformer.blocks.\g<i>"
 _STEMS = r"network.transformer.stems.\g<camera>"
 _HEAD_BLOCKS = r"network.head.blocks.\g<i>"
 _RULES: tuple[_Rule, ...] = (
-    _Rule(STEM + r"StdConv_(?P<i>\d)\.kernel", rf"{_STEMS}.convolutions.\g<i>.weight", _convolution),
-    _Rule(STEM + r"StdConv_(?P<i>\d)\.bias", rf"{_STEMS}.convolutions.\g<i>.bias", _same),
+    *_kernel(STEM + r"StdConv_(?P<i>\d)", rf"{_STEMS}.convolutions.\g<i>", _convolution),
     *_norm(STEM + r"GroupNorm_(?P<i>\d)", rf"{_STEMS}.norms.\g<i>"),
-    _Rule(STEM + r"embedding\.kernel", f"{_STEMS}.embedding.weight", _convolution),
-    _Rule(STEM + r"embedding\.bias", f"{_STEMS}.embedding.bias", _same),
-    *_linear(TRUNK + r"obs_(?P<camera>\w+)_projection", r"network.transformer.projections.\g<camera>"),
+    *_kernel(STEM + "embedding", f"{_STEMS}.embedding", _convolution),
+    *_kernel(TRUNK + r"obs_(?P<camera>\w+)_projection", r"network.transformer.projections.\g<camera>"),
     _Rule(
         TRUNK + r"obs_(?P<camera>\w+)_pos_embedding", r"network.transformer.image_positions.\g<camera>", _same
     ),
-    *_linear(TRUNK + r"task_language_projection", "network.transformer.language_projection"),
+    *_kernel(TRUNK + r"task_language_projection", "network.transformer.language_projection"),
     _Rule(TRUNK + r"task_language_pos_embedding", "network.transformer.language_positions", _same),
     _Rule(TRUNK + r"readout_action_pos_embedding", "network.transformer.readout_positions", _same),
     *(
@@ -87,21 +81,20 @@ _RULES: tuple[_Rule, ...] = (
             _Rule(ATTENTION + rf"{part}\.bias", f"{_BLOCKS}.{part}.bias", torch.flatten),
         )
     ),
-    _Rule(ATTENTION + r"out\.kernel", f"{_BLOCKS}.out.weight", _heads_in),
-    _Rule(ATTENTION + r"out\.bias", f"{_BLOCKS}.out.bias", _same),
+    *_kernel(ATTENTION + "out", f"{_BLOCKS}.out", _heads_in),
     *_norm(BLOCK + "LayerNorm_0", f"{_BLOCKS}.attention_norm"),
     *_norm(BLOCK + "LayerNorm_1", f"{_BLOCKS}.mlp_norm"),
-    *_linear(BLOCK + r"MlpBlock_0\.Dense_0", f"{_BLOCKS}.fc1"),
-    *_linear(BLOCK + r"MlpBlock_0\.Dense_1", f"{_BLOCKS}.fc2"),
+    *_kernel(BLOCK + r"MlpBlock_0\.Dense_0", f"{_BLOCKS}.fc1"),
+    *_kernel(BLOCK + r"MlpBlock_0\.Dense_1", f"{_BLOCKS}.fc2"),
     *_norm(TRUNK + r"BlockTransformer_0\.Transformer_0\.encoder_norm", "network.transformer.norm"),
     _Rule(HEAD + r"time_preprocess\.kernel", "network.head.frequencies", _same),
-    *_linear(HEAD + r"cond_encoder\.Dense_0", "network.head.time_fc1"),
-    *_linear(HEAD + r"cond_encoder\.Dense_1", "network.head.time_fc2"),
-    *_linear(HEAD + r"reverse_network\.Dense_0", "network.head.first"),
-    *_linear(HEAD + r"reverse_network\.Dense_1", "network.head.last"),
+    *_kernel(HEAD + r"cond_encoder\.Dense_0", "network.head.time_fc1"),
+    *_kernel(HEAD + r"cond_encoder\.Dense_1", "network.head.time_fc2"),
+    *_kernel(HEAD + r"reverse_network\.Dense_0", "network.head.first"),
+    *_kernel(HEAD + r"reverse_network\.Dense_1", "network.head.last"),
     *_norm(RESIDUAL + "LayerNorm_0", f"{_HEAD_BLOCKS}.norm"),
-    *_linear(RESIDUAL + "Dense_0", f"{_HEAD_BLOCKS}.fc1"),
-    *_linear(RESIDUAL + "Dense_1", f"{_HEAD_BLOCKS}.fc2"),
+    *_kernel(RESIDUAL + "Dense_0", f"{_HEAD_BLOCKS}.fc1"),
+    *_kernel(RESIDUAL + "Dense_1", f"{_HEAD_BLOCKS}.fc2"),
     _Rule(T5 + r"shared\.embedding", "language.shared.weight", _same),
     _Rule(T5 + r"(?P<rest>.+)\.kernel", r"language.\g<rest>.weight", _dense),
     _Rule(T5 + r"(?P<rest>.+)\.embedding", r"language.\g<rest>.weight", _same),
