@@ -34,7 +34,7 @@ def test_module_and_attribute_name_an_adapter(module: str) -> None:
 def test_entry_points_of_other_packages_are_adapters(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
     point = EntryPoint(name="theirs", value=f"{module}:make", group=registry.POLICY_GROUP)
     ours = EntryPoint(name="random", value=f"{module}:make", group=registry.POLICY_GROUP)
-    monkeypatch.setattr(registry, "_points", lambda _group: (point, ours))
+    monkeypatch.setattr(registry, "entry_points", lambda group: (point, ours))
 
     assert policy_factory("theirs").__module__ == module
     assert policy_factory("random").__module__ == "vla_eval.policies.controls.scripted"

@@ -14,7 +14,7 @@ import inspect
 import re
 import sys
 from collections.abc import Callable, Iterable, Mapping
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from importlib.util import find_spec
 from typing import Any
 
@@ -65,7 +65,7 @@ _OWN_ADAPTERS = ("vla_eval.policies.", "vla_eval.testing.")  # the rest of this 
 
 def policy_adapters() -> dict[str, str]:
     """Return name -> `module:attr` of all adapters; ours win over another package's of the same name."""
-    others: dict[str, str] = {point.name: point.value for point in _points(POLICY_GROUP)}
+    others: dict[str, str] = {point.name: point.value for point in entry_points(group=POLICY_GROUP)}
     return {**others, **POLICIES}
 
 
@@ -178,7 +178,3 @@ def _no_module(adapter: str, module_name: str) -> UnknownNameError:
         f"policy adapter '{adapter}': there is no module '{module_name}'. Install the package that holds it, "
         f"or put its folder on PYTHONPATH."
     )
-
-
-def _points(group: str) -> tuple[EntryPoint, ...]:
-    return tuple(entry_points(group=group))

@@ -196,10 +196,10 @@ def _change(actions: Tensor, real: Tensor) -> Tensor:
     return change.clamp(max=1.0)
 
 
-def decisions(actions: Tensor, *, same_action: float = SAME_ACTION) -> Tensor:
+def decisions(actions: Tensor) -> Tensor:
     """Return (T,): at which steps of an episode, (T, action), the arm begins to move after it waited."""
     real = torch.ones(1, len(actions), dtype=torch.bool)
-    return _begins(_change(actions[None], real) < same_action, real)[0]
+    return _begins(_change(actions[None], real) < SAME_ACTION, real)[0]
 
 
 def _begins(waits: Tensor, real: Tensor) -> Tensor:
