@@ -87,7 +87,7 @@ class PromptedConfig(PortedConfig):
     # leave actions beyond an episode's end out of the loss. False: chunks that have any are refused.
     do_mask_loss_for_padding: bool = False
     drop_n_last_frames: int = 0  # set by `__post_init__` for that; lerobot's sampler reads it
-    tokenizer_name: str = ""  # folder or name of the tokenizer; `bytes`: see `steps.byte_tokenizer`
+    tokenizer_name: str = ""  # folder or name of the tokenizer; `bytes`: see `byte_tokenizer`
     prompt_max_tokens: int = 256  # a longer prompt is an error
 
     def __post_init__(self) -> None:

@@ -4,7 +4,7 @@ Legend as in `network`. Decoding is greedy, as the original's. A chunk has a fix
 are predicted, and only their columns' tokens are taken for it (`from_tokens`).
 
 The translation's tokens come first, then the rotation's, then closed and open gripper. Within each the last
-axis counts fastest. The gripper is 0 (closed) to 1 (open) here; `steps.gripper` makes that of ManiSkill's -1
+axis counts fastest. The gripper is 0 (closed) to 1 (open) here; `shared.gripper` makes that of ManiSkill's -1
 to +1, of which a threshold at 0.5 would make "open" only beyond a half.
 """
 

@@ -54,7 +54,7 @@ class Sequence(NamedTuple):
 
 
 class SpatialVLANetwork(nn.Module):
-    """See the module's text; also the `LanguageModel` of `steps.greedy`."""
+    """See the module's text; also the `LanguageModel` of `shared.greedy`."""
 
     def __init__(self, sizes: NetworkSizes) -> None:
         super().__init__()
@@ -120,7 +120,7 @@ class SpatialVLANetwork(nn.Module):
     def read(
         self, embeddings: Tensor, mask: Tensor, places: Tensor, cache: DynamicCache | None = None
     ) -> Tensor:
-        """Return Gemma's last hidden states (B, T, D); see `steps.greedy.LanguageModel`."""
+        """Return Gemma's last hidden states (B, T, D); see `shared.greedy.LanguageModel`."""
         added = torch.zeros(mask.shape, dtype=embeddings.dtype, device=mask.device)
         added = added.masked_fill(~mask, torch.finfo(embeddings.dtype).min)[:, None]
         hidden: Tensor = self.llm(
