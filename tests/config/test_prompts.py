@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from vla_eval.config.prompts import instruction_for, instructions_for, load_prompts
+from vla_eval.config.prompts import instruction_for, load_prompts, sentences_of
 from vla_eval.errors import MissingInstructionError, RecipeError
 from vla_eval.tasks.catalog import TASKS, task_spec
 
@@ -70,7 +70,7 @@ def test_paraphrases_follow_the_sentence(tmp_path: Path) -> None:
     spec = task_spec("RememberColor3-v0")
 
     assert instruction_for(spec, prompts) == "one"
-    assert instructions_for(spec, prompts) == ("one", "two")
+    assert sentences_of(load_prompts(prompts), spec) == ("one", "two")
 
 
 @pytest.mark.parametrize(
