@@ -56,7 +56,11 @@ class OfficialEnv:
         self.device: dict[str, str] = {}
         if "/ShellGame" in row.id:
             self.device[MUG] = provide_mug(settings.kwargs.get(MUG, "ycb"), task=row.id)
-        self._envs = [_build(cls, settings) for _ in range(settings.n_slots)]
+        # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.
+        arm = {"control_mode": ACTION.control_mode, "robot_uids": ROBOT, "reconfiguration_freq": 1}
+        self._envs = [
+            build(cls, settings, num_envs=1, sim_backend="physx_cpu", **arm) for _ in range(settings.n_slots)
+        ]
         self._episodes: dict[int, OfficialEpisode] = {}
         self.device |= describe(self._envs[0], settings)
         self.spec = offered_by(row, settings.kwargs)
@@ -153,19 +157,6 @@ def _adapted(cls: Any) -> Any:
         return {}
 
     return type(cls.__name__, (TrueStates, cls), {"__module__": cls.__module__, "get_obs": get_obs})
-
-
-def _build(cls: Any, settings: EnvSettings) -> Any:
-    # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.
-    return build(
-        cls,
-        settings,
-        num_envs=1,
-        control_mode=ACTION.control_mode,
-        robot_uids=ROBOT,
-        sim_backend="physx_cpu",
-        reconfiguration_freq=1,
-    )
 
 
 def _wording(row: TaskSpec, info: Any) -> dict[str, str]:

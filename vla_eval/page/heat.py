@@ -37,15 +37,6 @@ class HeatMap:
             TOP_PX + CELL_PX[1] * len(self.rows) + BOTTOM_PX,
         )
 
-    @property
-    def description(self) -> str:
-        """The rates in words, for screen readers."""
-        return "; ".join(
-            f"{self.row_title} {row}, {self.column_title} {column}: {rate_text(rate)}"
-            for row, rates in zip(self.rows, self.rates, strict=True)
-            for column, rate in zip(self.columns, rates, strict=True)
-        )
-
 
 def heat_chart(heat: HeatMap) -> Chart:
     """Return a heat map for a page."""
@@ -53,7 +44,12 @@ def heat_chart(heat: HeatMap) -> Chart:
         width, height = heat.size_px
         figure = Figure(figsize=(width * PX, height * PX), frameon=False)
         _draw(figure, heat, left=0, whole=(width, height))
-        return Chart(heat.title, inline_svg(figure, label=f"{heat.title}. {heat.description}"))
+        described = "; ".join(  # for screen readers
+            f"{heat.row_title} {row}, {heat.column_title} {column}: {rate_text(rate)}"
+            for row, rates in zip(heat.rows, heat.rates, strict=True)
+            for column, rate in zip(heat.columns, rates, strict=True)
+        )
+        return Chart(heat.title, inline_svg(figure, label=f"{heat.title}. {described}"))
 
 
 def heat_png(maps: Sequence[HeatMap]) -> bytes:

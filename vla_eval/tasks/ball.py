@@ -53,17 +53,15 @@ class RollingBallEnv(WithoutCueEnv):
             radius=self.ball_radius_m,
             color=[1.0, 0.0, 0.0, 1.0],
             name="ball",
-            initial_pose=sapien.Pose(p=[SPAWN_X_M[0], SPAWN_Y_M[0], self._ball_start_z_m()]),
+            initial_pose=sapien.Pose(p=[SPAWN_X_M[0], SPAWN_Y_M[0], self.ball_radius_m + self.BALL_DROP_M]),
         )
         self._start: FloatArray = np.zeros((self.num_envs, 3), dtype=np.float32)
         self._initial_velocity = np.zeros_like(self._start)
 
-    def _ball_start_z_m(self) -> float:
-        return self.ball_radius_m + self.BALL_DROP_M
-
     def _sample_episode(self, env: int) -> None:
         layout = self.episode_generator(env, Stream.LAYOUT)
-        start_m = (layout.uniform(*SPAWN_X_M), layout.uniform(*SPAWN_Y_M), self._ball_start_z_m())
+        z_m = self.ball_radius_m + self.BALL_DROP_M
+        start_m = (layout.uniform(*SPAWN_X_M), layout.uniform(*SPAWN_Y_M), z_m)
         self._sample_goal(env, layout, lane_x_m=start_m[0])
         motion = self.episode_generator(env, Stream.MOTION)
         side_m_s = motion.uniform(*SIDE_VELOCITY_M_S)

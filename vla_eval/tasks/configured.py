@@ -27,14 +27,9 @@ def read_configured[C](
 
     Fingerprints and names of folders contain the tasks as they are here.
 
-    Args:
-        cls: the class of the configuration; rows of a table may have `tasks` of their own.
-        file: a file, or a name in `folder`; None: the fields `start`.
-        folder: where names are looked up.
-        start: the fields without a file.
-        edit: puts on top what was asked for: flags, arguments.
-        check: refuses fields that are missing without a file.
-        where: who gave the fields, for messages.
+    It is read from a file, or from one of this name in `folder`; without a file it has the fields `start`, of
+    which `check` refuses those that are missing, for messages given by `where`. `edit` puts on top what was
+    asked for: flags, arguments. Rows of a table may have `tasks` of their own.
     """
 
     def complete(data: dict[str, Any]) -> None:

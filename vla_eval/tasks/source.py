@@ -41,7 +41,9 @@ def task_arguments(entry_point: str) -> tuple[TaskArgument, ...]:
                 annotation = ast.unparse(argument.annotation) if argument.annotation else "Any"
                 found.append(TaskArgument(argument.arg, _value(module, default), annotation, node.name))
             seen.update(argument.name for argument in found)
-            seen.update(_given_to_base(init))
+            calls = (call for call in ast.walk(init) if isinstance(call, ast.Call))
+            to_base = (call for call in calls if ast.unparse(call.func) == "super().__init__")
+            seen.update(keyword.arg for call in to_base for keyword in call.keywords if keyword.arg)
     return tuple(found)
 
 
@@ -54,12 +56,6 @@ def class_constant(entry_point: str, name: str) -> object:
                 value = getattr(line, "value", None)
                 return None if value is None else ast.literal_eval(value)
     return None
-
-
-def _given_to_base(init: ast.FunctionDef) -> Iterator[str]:
-    for call in ast.walk(init):
-        if isinstance(call, ast.Call) and ast.unparse(call.func) == "super().__init__":
-            yield from (keyword.arg for keyword in call.keywords if keyword.arg is not None)
 
 
 class _Module(NamedTuple):
