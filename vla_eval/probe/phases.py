@@ -7,14 +7,12 @@ from typing import Any, Literal, NamedTuple
 from vla_eval.errors import RecipeError
 from vla_eval.tasks.spec import TaskSpec, total_cue_steps
 
-CUE_STEPS = 5
-DELAY_STEPS = 5
-SHELL_GAME_DELAY_STEPS = 0
+CUE_STEPS, DELAY_STEPS = 5, 5
 
 
 def default_delay_steps(spec: TaskSpec) -> int:
     """Return the default of `delay_steps`: only the shell game, whose cue marks the place, has another."""
-    return SHELL_GAME_DELAY_STEPS if spec.cue_marks_place else DELAY_STEPS
+    return 0 if spec.cue_marks_place else DELAY_STEPS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

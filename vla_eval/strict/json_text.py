@@ -109,9 +109,6 @@ def read_file(path: Path, source: Source) -> bytes:
         ) from exc
 
 
-# ------------------------------------------------------------------------------------------ JSON
-
-
 def loads(content: str | bytes, *, lone_surrogates: bool = False, non_finite: bool = False) -> Any:
     """Return what JSON holds, or raise `ValueError`; text may hold lone surrogates, if asked."""
     text = content if isinstance(content, str) else content.decode("utf-8")
@@ -163,8 +160,6 @@ def _check_nesting(data: object) -> None:
             return
     raise ValueError(TOO_DEEP)
 
-
-# ------------------------------------------------------------------------------------------ types
 
 STRICT_TYPES = frozenset({"int", "float", "bool"})
 

@@ -119,9 +119,6 @@ def _check_actions(settings: RemoteSettings, server: ServerMetadata, env: EnvSpe
         )
 
 
-# ------------------------------------------------------------------------------------------ cameras
-
-
 def _cameras(
     settings: RemoteSettings, server: ServerMetadata, env: EnvSpec, *, where: str
 ) -> dict[str, CameraSettings]:
@@ -171,9 +168,6 @@ def _check_size(camera: CameraSettings, name: str, env: EnvSpec, *, where: str) 
             f"'{name}' in {env.task} have {size[0]} × {size[1]}. Set args.cameras.{name}.resize to pad or "
             f"plain in the recipe, as the policy was trained."
         )
-
-
-# ------------------------------------------------------------------------------------------ state
 
 
 def _state(
