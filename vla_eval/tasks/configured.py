@@ -27,9 +27,9 @@ def read_configured[C](
 
     Fingerprints and names of folders contain the tasks as they are here.
 
-    `file` is a file, or a name in `folder`; without one there are the fields `start`, and `check` refuses what
-    is missing. `edit` puts on top what was asked for: flags, arguments. `where`: who gave the fields, for
-    messages. Rows of a table may have `tasks` of their own.
+    `file` is a file, or a name in `folder`; without one there are the fields `start`, and `check` refuses
+    what is missing. `edit` puts on top what was asked for: flags, arguments. `where`: who gave the fields,
+    for messages. Rows of a table may have `tasks` of their own.
     """
 
     def complete(data: dict[str, Any]) -> None:
