@@ -161,7 +161,7 @@ def _lerobots_loader(dataset: Any, config: Any, order: Sequence[int], n_batches:
         "persistent_workers": config.persistent_workers,
         "multiprocessing_context": config.dataloader_multiprocessing_context,
     }
-    loader = DataLoader(
+    return DataLoader(
         dataset,
         batch_size=config.batch_size,
         sampler=list(itertools.islice(itertools.cycle(order), n_batches * config.batch_size)),
@@ -169,7 +169,6 @@ def _lerobots_loader(dataset: Any, config: Any, order: Sequence[int], n_batches:
         collate_fn=lerobot_collate_fn if dataset.meta.has_language_columns else None,
         **(in_workers if n_processes else {}),
     )
-    return loader
 
 
 def _rate(loader: Any, n_first: int, n_batches: int) -> float:

@@ -114,7 +114,7 @@ def evaluate(
         n_open = queue.n_episodes
         n_workers = worker_count(resolved, plan, n_jobs=queue.n_batches)
         observer.on_start(plan, n_finished=len(plan.jobs) - n_open, n_workers=n_workers)
-        bookkeeper = _Bookkeeper(folder=folder, path=path, resolved=resolved, observer=observer, queue=queue)
+        bookkeeper = _Bookkeeper(folder=folder, resolved=resolved, observer=observer, queue=queue)
         was_stopped = bool(n_open) and _run_phases(plan, bookkeeper, finished)
     return EvaluationSummary(
         out=path,
@@ -164,7 +164,7 @@ def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
 
 def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey]) -> bool:
     """Run the episodes that have no result; return whether the observer stopped it."""
-    logs, resolved = bookkeeper.path / "logs", bookkeeper.resolved
+    logs, resolved = bookkeeper.folder.path / "logs", bookkeeper.resolved
     logs.mkdir(exist_ok=True)
     spec = WorkerSpec(
         runner=_runner(bookkeeper),
@@ -198,7 +198,7 @@ def _runner(bookkeeper: "_Bookkeeper") -> RunnerClass:
     config = bookkeeper.resolved.config
     capture = None
     if config.capture.is_on:
-        folder = bookkeeper.path.resolve()
+        folder = bookkeeper.folder.path.resolve()
         capture = EpisodeCapture(config=config.capture, folder=folder, seed_start=config.seed_start)
     return RunnerClass(target=RUNNER, options={"capture": capture})
 
@@ -240,7 +240,6 @@ class _Bookkeeper:
     """Stores what comes from the workers, and decides when to give up."""
 
     folder: RunFolder
-    path: Path
     resolved: ResolvedEvaluation
     observer: EvaluationObserver
     queue: JobQueue
@@ -303,6 +302,6 @@ class _Bookkeeper:
             raise TooManyErrorsError(
                 f"{self.n_consecutive_errors} episodes in a row ended in an error (max_consecutive_errors). "
                 f"The last: {job.key.policy} on {job.key.task}, seed {job.key.seed}: {error.kind} during "
-                f"{error.stage}: {error.message} All results are kept in {self.path}; the same command "
-                f"retries the errors."
+                f"{error.stage}: {error.message} All results are kept in {self.folder.path}; the same "
+                f"command retries the errors."
             )

@@ -35,7 +35,7 @@ class Inference(NamedTuple):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Begin:
     slot: int
-    start: EpisodeStart
+    start: EpisodeStart | None  # None: only forget what was before
     done: Future[None] = field(default_factory=Future)
 
 
@@ -48,17 +48,11 @@ class _Infer:
     done: Future[Inference] = field(default_factory=Future)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Forget:
-    slot: int
-    done: Future[None] = field(default_factory=Future)
-
-
 class PolicyFailure(VlaEvalError):
     """The policy raised an exception; it is the cause."""
 
 
-_Request = _Begin | _Infer | _Forget
+_Request = _Begin | _Infer
 
 
 class Batcher:
@@ -98,7 +92,7 @@ class Batcher:
 
     def forget(self, slot: int) -> None:
         """Have the policy forget a slot, after what was asked for it before."""
-        self._put(_Forget(slot=slot))
+        self._put(_Begin(slot=slot, start=None))
 
     def close(self, *, seconds: float | None = None) -> bool:
         """Finish the pass under way, cancel the rest, and end the thread; return whether it has ended."""
@@ -111,7 +105,7 @@ class Batcher:
         self._thread.join(seconds)
         return not self._thread.is_alive()
 
-    def _put[R: (_Begin, _Infer, _Forget)](self, request: R) -> R:
+    def _put[R: (_Begin, _Infer)](self, request: R) -> R:
         with self._changed:
             if self._is_closed:
                 request.done.cancel()
@@ -146,9 +140,9 @@ class Batcher:
             if due:
                 self._infer(due)
 
-    def _prepare(self, request: _Begin | _Forget) -> None:
+    def _prepare(self, request: _Begin) -> None:
         try:
-            if isinstance(request, _Begin):
+            if request.start is not None:
                 self._policy.reset([request.start])
             elif isinstance(self._policy, ForgettingPolicy):
                 self._policy.forget([request.slot])

@@ -66,11 +66,6 @@ class WorkerProcess:
     """One process; it starts with its first job.
 
     `predecessor` is to end before it starts: two policies are never loaded at once.
-
-    Attributes:
-        connection: our end of the pipe.
-        start_error: why it could not be started or handed a job.
-        is_starting: the system has been asked for the process and has not answered yet.
     """
 
     def __init__(
@@ -85,7 +80,7 @@ class WorkerProcess:
         self.index = index
         self.log = log
         self.connection, self._their_connection = context.Pipe()
-        self.start_error: BaseException | None = None
+        self.start_error: BaseException | None = None  # why it could not be started or handed a job
         self._inbox = Inbox(self.connection)
         self._their_lifeline, self._lifeline = context.Pipe(duplex=False)
         self._shared: SharedStage = context.RawArray("d", SHARED_SIZE)
@@ -93,7 +88,8 @@ class WorkerProcess:
         self._context = context
         self._predecessor = predecessor
         self._process: ForkServerProcess | SpawnProcess | None = None
-        self.is_starting = self._is_abandoned = False
+        self.is_starting = False  # whether the system was asked for the process and has not answered yet
+        self._is_abandoned = False
         self._thread: threading.Thread | None = None
         self._log_offset = 0  # where the log of the present job begins
         self._given_at = 0.0

@@ -25,7 +25,9 @@ class ReplayRunner(SimulatorRunner[ReplayJob, EpisodeReplayed]):
     def _do(self, job: ReplayJob) -> EpisodeReplayed:
         episode = job.episode
         env = self._make_env(job.env)
-        dataset = self._opened(job)
+        if self._dataset is None or self._dataset.root != job.dataset:
+            self._dataset = LocalDataset(job.dataset)
+        dataset = self._dataset
         log = replay_actions(
             env, episode.start(), episode.action_rows(), heartbeat=self._heartbeat, with_pictures=job.pixels
         )
@@ -49,11 +51,6 @@ class ReplayRunner(SimulatorRunner[ReplayJob, EpisodeReplayed]):
         return EpisodeReplayed(
             episode_index=episode.episode_index, mismatches=tuple(mismatches), psnr_db=quality
         )
-
-    def _opened(self, job: ReplayJob) -> LocalDataset:
-        if self._dataset is None or self._dataset.root != job.dataset:
-            self._dataset = LocalDataset(job.dataset)
-        return self._dataset
 
 
 def _decode(dataset: LocalDataset, episode: RecordedEpisode) -> dict[str, list[ImageArray]]:
