@@ -5,9 +5,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,6 +18,8 @@ from torch.utils.data import DataLoader
 
 from tests.data.hostile_datasets import Bait, addresses, hostile_columns
 from tests.data.replays import passed
+from tests.forked import Forked, start_command
+from tests.waiting import is_alive, wait_until
 from vla_eval.cli.main import main
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.data.dataset_folder import check_dataset
@@ -195,19 +194,16 @@ class TestDamage:
 
 
 class TestKill:
-    def start(self, out: Path) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", "vla_eval.cli", "record", "--task", TASK]
-        command += ["--episodes", str(N_EPISODES), "--workers", "2", "--out", str(out)]
+    def start(self, out: Path) -> Forked:
+        command = ["record", "--task", TASK, "--episodes", str(N_EPISODES), "--workers", "2"]
         command += ["--set", "simulator=fake", "--set", "episodes_per_shard=2", "--set", "name=test"]
-        command += ["--allow-environment-change", "--no-replay"]
-        return subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        command += ["--allow-environment-change", "--no-replay", "--out", str(out)]
+        return start_command(command, out.parent)
 
-    def kill_when(self, process: subprocess.Popen[bytes], holds: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 120
-        while not holds() and process.poll() is None and time.monotonic() < deadline:
-            time.sleep(0.01)
-        process.send_signal(signal.SIGKILL)
-        process.wait()
+    def kill_when(self, command: Forked, holds: Callable[[], bool]) -> None:
+        wait_until(lambda: holds() or not is_alive(command.pid))
+        os.kill(command.pid, signal.SIGKILL)
+        command.wait()
 
     def test_killed_twice_and_by_two_workers_it_is_the_same_dataset_which_replays_and_is_trained_on(
         self, recorded: RecordedDataset, tmp_path: Path
@@ -224,7 +220,7 @@ class TestKill:
         with pytest.raises(DatasetError, match="no finished dataset"):
             replay_module.find_datasets(out)
 
-        assert self.start(out).wait() == 0
+        assert self.start(out).wait().returncode == 0
 
         # Tables, videos, statistics and manifest: each file byte for byte.
         assert check_dataset(out / TASK).files == recorded.facts.files

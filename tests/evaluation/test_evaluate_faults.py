@@ -3,8 +3,6 @@
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from typing import Any, ClassVar
 
@@ -12,6 +10,7 @@ import pytest
 
 from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import SHORT, TASK, Bench
+from tests.forked import Forked, start_command
 from tests.waiting import HANGS_AFTER_S, is_alive, wait_until
 from vla_eval.errors import RecipeError, SpecMismatchError, TooManyErrorsError
 
@@ -159,34 +158,20 @@ class TestMistakes:
 
 
 class TestKills:
-    """Through the command line, as it is killed in real life."""
+    """Through the command line, as it is killed in real life, but for the seconds of its imports."""
 
     EPISODES = 12
 
-    def start(self, bench: Bench, out: str, *, workers: int = 2) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "vla_eval.cli", "eval", "--task", TASK, "--policy", "night.yaml"]
+    def start(self, bench: Bench, out: str, *, workers: int = 2) -> Forked:
+        command = ["eval", "--task", TASK, "--policy", "night.yaml"]
         command += ["--episodes", str(self.EPISODES), "--workers", str(workers), "--out", out]
-        command += [
-            "--allow-environment-change",
-            "--set",
-            "simulator=fake",
-            *(f"--set=env.{k}={v}" for k, v in SHORT.items()),
-        ]
-        return subprocess.Popen(
-            command,
-            cwd=bench.folder,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-            # A shell that runs the tests in the background has SIGINT ignored, and children inherit that.
-            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
-        )
+        command += ["--allow-environment-change", "--set", "simulator=fake"]
+        return start_command([*command, *(f"--set=env.{k}={v}" for k, v in SHORT.items())], bench.folder)
 
     def finish(self, bench: Bench, out: str) -> str:
-        stdout, stderr = (process := self.start(bench, out)).communicate(timeout=HANGS_AFTER_S)
-        assert process.returncode == 0, stderr
-        return stdout
+        done = self.start(bench, out).wait(HANGS_AFTER_S)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
 
     def test_kill_9_at_any_moment_loses_nothing_and_leaves_nothing(self, bench: Bench) -> None:
         bench.write_policy(pause=0.02)  # 12 steps x 0.02 s: a quarter of a second per episode
@@ -194,9 +179,9 @@ class TestKills:
         rng = random.Random(1)
         for _ in range(3):
             process = self.start(bench, "killed")
-            time.sleep(rng.uniform(0.7, 1.6))
+            time.sleep(rng.uniform(0.1, 1.6))
             os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
+            process.wait(HANGS_AFTER_S)
             wait_until(lambda: not any(is_alive(pid) for pid in bench.worker_pids()))
 
         table = self.finish(bench, "killed")
@@ -212,12 +197,12 @@ class TestKills:
         bench.write_policy(pause=0.05)
         process = self.start(bench, "out")
         wait_until(lambda: bool(bench.worker_pids()))
-        process.send_signal(number)
-        stdout, stderr = process.communicate(timeout=HANGS_AFTER_S)
+        os.kill(process.pid, number)
+        done = process.wait(HANGS_AFTER_S)
 
-        assert process.returncode == exit_code
-        assert stdout == ""
-        assert "To resume: mikasa-vla eval --task" in stderr
+        assert done.returncode == exit_code
+        assert done.stdout == ""
+        assert "To resume: mikasa-vla eval --task" in done.stderr
         wait_until(lambda: not any(is_alive(pid) for pid in bench.worker_pids()))
         self.finish(bench, "out")
 
@@ -226,10 +211,10 @@ class TestKills:
         process = self.start(bench, "out", workers=1)
         wait_until(lambda: bool(bench.worker_pids()))
         os.kill(next(iter(bench.worker_pids())), signal.SIGKILL)
-        _, stderr = process.communicate(timeout=HANGS_AFTER_S)
+        done = process.wait(HANGS_AFTER_S)
 
         errors = [r.error for r in bench.records("out").values() if r.error]
-        assert process.returncode == 3, stderr
+        assert done.returncode == 3, done.stderr
         assert [error.kind for error in errors] == ["WorkerCrashed"]
         assert "SIGKILL" in errors[0].message
         assert "--workers" in errors[0].message

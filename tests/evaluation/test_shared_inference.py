@@ -4,8 +4,6 @@ import contextlib
 import json
 import os
 import signal
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -15,6 +13,7 @@ import pytest
 from tests.evaluation.evaluation_bench import Bench
 from tests.evaluation.evaluation_bench import bench as bench
 from tests.evaluation.resolved import evaluate, make_plan, results_config
+from tests.forked import start_command
 from tests.waiting import is_alive, wait_until
 from vla_eval.errors import RunChangedError, TooManyErrorsError, VlaEvalError
 from vla_eval.evaluation import plan as plans
@@ -198,22 +197,17 @@ def test_a_policy_that_cannot_be_made_ends_the_run_with_its_cause(network: Bench
 
 def test_the_servers_of_a_run_end_with_it_even_if_it_is_killed(network: Bench) -> None:
     config = {
-        **{"name": "killed", "tasks": ["RememberColor3-v0"], "simulator": "fake", "episodes": 100_000},
+        **{"name": "killed", "tasks": ["RememberColor3-v0"], "simulator": "fake", "episodes": 2_000},
         **{"policies": [str(network.folder / "night.yaml")], "inference": "shared", "workers": 1},
     }
     (network.folder / "killed.yaml").write_text(json.dumps(config))
-    command = (sys.executable, "-m", "vla_eval.cli", "eval", str(network.folder / "killed.yaml"))
-    environment = {**os.environ, "PYTHONPATH": f"{network.folder}:{os.environ.get('PYTHONPATH', '')}"}
-    out = network.folder / "out"
-    records = out / "episodes.jsonl"
-    with subprocess.Popen(
-        (*command, "--out", str(out)), env=environment, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL
-    ) as process:
-        try:
-            wait_until(lambda: records.exists() and records.stat().st_size > 0)
-            (server,) = network.worker_pids()
-        finally:
-            process.kill()  # else leaving waits for 100,000 episodes
+    records = network.folder / "out" / "episodes.jsonl"
+    process = start_command(["eval", "killed.yaml", "--out", "out"], network.folder)
+    try:
+        wait_until(lambda: records.exists() and records.stat().st_size > 0)
+        (server,) = network.worker_pids()
+    finally:
+        os.kill(process.pid, signal.SIGKILL)  # else it evaluates all episodes
     wait_until(lambda: not is_alive(server))
 
 
