@@ -54,6 +54,17 @@ def light_workers() -> Iterator[None]:
         _swap(here, kept)
 
 
+@pytest.fixture(scope="module")
+def in_this_process() -> Iterator[None]:
+    """Let commands of this module evaluate and record in this process, where workers are not the subject."""
+    from vla_eval.workers.in_process import IN_PROCESS
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("vla_eval.cli.shared.cluster.LOCAL", IN_PROCESS)
+        patch.setattr("vla_eval.cli.record.LOCAL", IN_PROCESS)
+        yield
+
+
 def _swap(one: dict[str, Any], other: dict[str, Any]) -> None:
     before = dict(one)
     one.clear()

@@ -19,7 +19,6 @@ from tests.serving.served_policies import Running
 from vla_eval.cli.main import main
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.serving.server import ServerOptions
-from vla_eval.workers.in_process import IN_PROCESS
 
 NOT_EXECUTED: Mapping[str, str] = {
     r"audit --suite .*|audit": "oracles of all tasks, which the fake simulator has not; tests/audit",
@@ -114,14 +113,13 @@ def server() -> Iterator[str]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _in_this_process() -> Iterator[None]:
+def _serves_no_one() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vla_eval.cli.shared.cluster.LOCAL", IN_PROCESS)
-        patch.setattr("vla_eval.cli.record.LOCAL", IN_PROCESS)
         patch.setattr("vla_eval.serving.server.run_server", lambda *_, ready, **__: ready(8000))
         yield
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("command", EXECUTED)
 def test_a_command_of_the_docs_is_executed(
     command: str,

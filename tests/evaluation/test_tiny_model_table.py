@@ -11,6 +11,7 @@ from tests.evaluation.test_model_table import PAPER, TASK
 from vla_eval.cli.main import main
 from vla_eval.evaluation.model_table import load_model_table
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
 cache_of_its_own = test_model_table.cache_of_its_own
 small = test_model_table.small
 

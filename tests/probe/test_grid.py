@@ -19,7 +19,7 @@ from vla_eval.probe.phases import fixed_phases, inferences
 from vla_eval.records import EpisodeError, EpisodeRecord
 from vla_eval.tasks.catalog import task_spec
 
-pytestmark = pytest.mark.usefixtures("light_workers")
+pytestmark = pytest.mark.usefixtures("in_this_process")
 
 TASK = "RememberColor3-v0"
 FAKE = ["--set", "simulator=fake", "--workers", "1"]

@@ -21,6 +21,8 @@ from vla_eval.tasks.catalog import TASKS, task_spec
 from vla_eval.tasks.memory_env import MemoryTableEnv
 from vla_eval.tasks.register import env_class
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 FAKE = ["--set", "simulator=fake", "--workers", "1"]
 N = 9
 PLACE_MODULE = """

@@ -25,6 +25,8 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import RunDescription, StoredRun
 from vla_eval.viz.filmstrip import read_strip
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
 TASK = "RememberColor3-v0"
 
 

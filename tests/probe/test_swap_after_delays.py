@@ -12,6 +12,7 @@ from vla_eval.probe.table import probe_table
 from vla_eval.probe.worlds import ProbeSettings
 from vla_eval.records import EpisodeRecord
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
 N_SEEDS = 12
 
 
