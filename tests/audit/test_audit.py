@@ -158,6 +158,7 @@ def test_an_audit_does_not_depend_on_the_order_in_which_episodes_came_to_an_end(
     assert one == other
 
 
+@pytest.mark.usefixtures("in_this_process")
 def test_the_command_plays_prints_and_goes_on_where_it_stopped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,7 @@ from vla_eval.cli import finetune
 from vla_eval.cli.main import build_parser, main
 from vla_eval.training.request import FinetuneSummary
 
+pytestmark = pytest.mark.usefixtures("in_this_process")
 TASK = "RememberColor3-v0"
 
 

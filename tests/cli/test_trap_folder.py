@@ -257,8 +257,13 @@ def test_no_process_of_any_kind_that_verbs_start_imports_from_the_working_direct
 
 @pytest.mark.parametrize(
     "search_path",
-    [f"{ROOT}:", f":{ROOT}", f"{ROOT}::{ROOT}", f":{ROOT}:"],
-    ids=["last", "first", "mid", "both"],
+    [
+        pytest.param(f":{ROOT}::{ROOT}:", id="everywhere"),
+        *(
+            pytest.param(path, id=name, marks=pytest.mark.slow)
+            for name, path in {"last": f"{ROOT}:", "first": f":{ROOT}", "mid": f"{ROOT}::{ROOT}"}.items()
+        ),
+    ],
 )
 def test_an_empty_entry_of_pythonpath_is_not_the_working_directory_of_children(
     search_path: str, tmp_path: Path
@@ -284,7 +289,7 @@ def test_a_folder_that_pythonpath_names_is_searched_also_if_it_is_the_working_di
         "    return make_cue_blind(context)\n"
     )
     (tmp_path / "my_policy.yaml").write_text("version: 1\ndescription: mine\nadapter: my_policy:make\n")
-    for search_path in (".", f".{os.pathsep}{ROOT}", f"{ROOT}{os.pathsep}{tmp_path}"):
+    for search_path in (".", f"{ROOT}{os.pathsep}{tmp_path}"):
         out = tmp_path / f"run-{len(search_path)}"
         command = f"eval --task {TASK} --policy my_policy.yaml --episodes 1 {FAKE} --out {out}"
         environment = environment_of(tmp_path, PYTHONPATH=f"{search_path}{os.pathsep}{ROOT}")
@@ -292,4 +297,4 @@ def test_a_folder_that_pythonpath_names_is_searched_also_if_it_is_the_working_di
             command_line(command, tmp_path), cwd=tmp_path, env=environment, capture_output=True, text=True
         )
         assert process.returncode == 0, process.stderr
-    assert len(list(tmp_path.glob("made-by-*"))) >= 3
+    assert len(list(tmp_path.glob("made-by-*"))) >= 2

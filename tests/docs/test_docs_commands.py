@@ -168,6 +168,7 @@ CONTENTS = {
 """Pages whose commands are run in their order -> verbs that are among them."""
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("page", CONTENTS)
 def test_the_marked_commands_of_a_page_run_on_the_fake_simulator(
     page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -5,28 +5,32 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
+from tests.forked import start_command
+
 ROOT = Path(__file__).parents[2]
 
 
-def test_the_example_policy_passes_the_check_and_is_evaluated(tmp_path: Path) -> None:
+def test_the_example_policy_passes_the_check_and_is_evaluated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text = (ROOT / "docs" / "policies.md").read_text()
     (policy,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     (recipe,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "my_policy.py").write_text(policy)
     (tmp_path / "my_policy.yaml").write_text(recipe)
-    environment = {"PYTHONPATH": f"{tmp_path}:{ROOT}", "PATH": "/usr/bin:/bin", "HOME": str(tmp_path)}
+    monkeypatch.syspath_prepend(tmp_path)  # of a process that is forked; else PYTHONPATH
 
     def run(*arguments: str) -> str:
-        done = subprocess.run(
-            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True
-        )
+        done = start_command(arguments, tmp_path).wait()
         assert done.returncode == 0, done.stderr
         return done.stdout
 
-    checked = run("-m", "vla_eval.cli", "check", "my_policy.yaml")
+    checked = run("check", "my_policy.yaml")
     assert "The same episode seed and observations give the same actions beside another episode." in checked
     table = run(
-        "-m", "vla_eval.cli", "eval", "--task", "RememberColor3-v0", "--policy", "my_policy.yaml",
+        "eval", "--task", "RememberColor3-v0", "--policy", "my_policy.yaml",
         "--n-action-steps", "4", "8", "--episodes", "2", "--workers", "1", "--out", str(tmp_path / "run"),
         "--set", "simulator=fake", "--format", "csv",
     )  # fmt: skip

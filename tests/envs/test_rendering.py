@@ -1,13 +1,13 @@
 """What a policy sees: the same pixels however and wherever the episode runs, and nothing in vain."""
 
-import subprocess
-import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.forked import run_forked
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, Observation, ObservationWindow, StepResult
@@ -265,7 +265,6 @@ env.reset({0: 2}, render=False)
 """
 
 
-def test_resets_without_cameras_make_no_new_vulkan_instance() -> None:
-    command = [sys.executable, "-c", WITHOUT_CAMERAS]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+def test_resets_without_cameras_make_no_new_vulkan_instance(tmp_path: Path) -> None:
+    done = run_forked(WITHOUT_CAMERAS, tmp_path)  # of a process that has made none
     assert done.returncode == 0, done.stderr

@@ -49,6 +49,8 @@ def traced(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[dict[str, Any]]]:
 
     torch._dynamo.reset()
     monkeypatch.setattr(torch, "compile", trace)
+    # Which vectors the processor knows, a compiler asks: by a process that imports torch for each kind.
+    monkeypatch.setattr(compiling, "pick_vec_isa", lambda: None)
     yield asked
     torch._dynamo.reset()
 
@@ -163,6 +165,7 @@ class TestWarmUp:
         torch._dynamo.reset()
         compile_ = torch.compile
         monkeypatch.setattr(torch, "compile", lambda function, **_: compile_(function, backend=fails))
+        monkeypatch.setattr(compiling, "pick_vec_isa", lambda: None)
         policy = made(act, env, compile=True)
 
         with pytest.raises(SpecMismatchError, match=r"no working C\+\+ compiler.*apt-get install g\+\+"):
