@@ -1,11 +1,13 @@
 """For all tests: no access to the Hub; workers fork from one server; fixtures that several rooms use."""
 
 import contextlib
+import functools
 import gc
 import os
 import shutil
 import socket
 from collections.abc import Callable, Generator, Iterator
+from importlib import metadata
 from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,9 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 from vla_eval.workers import start  # after the lines above
 from vla_eval.workers.start import worker_context
+
+# Asked by transformers and by diffusers when they are imported, 0.7 CPU s each.
+setattr(metadata, "packages_distributions", functools.cache(metadata.packages_distributions))  # noqa: B010
 
 gc.disable()  # while tests are collected: what a module makes stays
 
