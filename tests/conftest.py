@@ -66,7 +66,6 @@ def in_this_process() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("vla_eval.cli.shared.cluster.LOCAL", IN_PROCESS)
-        patch.setattr("vla_eval.cli.record.LOCAL", IN_PROCESS)
         yield
 
 
