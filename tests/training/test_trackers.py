@@ -234,12 +234,12 @@ def test_wandb_offline_continues_its_run_in_any_folder_under_the_lock(
         main(command)
     (first,) = offline_runs(run)
     assert logged_steps(first) == [1, 2, 3]
-    run_id = first.name.rpartition("-")[2]
+    run_id = first.name.split("-")[3]  # offline-run-TIME-ID, or …-1 if TIME, in seconds, is the same
     if cleaned:
         shutil.rmtree(run / "train" / "wandb")
     assert main(command) == 0
     last = offline_runs(run)[-1]
-    assert last.name.rpartition("-")[2] == run_id
+    assert last.name.split("-")[3] == run_id
     assert logged_steps(last) == [3, 4]
 
 
