@@ -115,7 +115,7 @@ def server() -> Iterator[str]:
 @pytest.fixture(scope="module", autouse=True)
 def _serves_no_one() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("vla_eval.serving.server.run_server", lambda *_, ready, **__: ready(8000))
+        patch.setattr("vla_eval.serving.server.run_server", lambda *_, ready, **__: ready(8000, None))
         yield
 
 
