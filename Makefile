@@ -3,7 +3,7 @@
 # If it is set, each of the many test processes compiles torch's sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo suite90 test test-all rehearse gpu-check lint docs bench clean
+.PHONY: help setup demo suite90 base test test-all rehearse gpu-check lint docs bench clean
 
 BIN := .venv/bin
 # Each takes about 2 GB, and 10 s to start. One more than two cores: tests wait for processes that they stop.
@@ -25,10 +25,13 @@ suite90: setup  ## install the official package of 90 tasks beside this one, wit
 		--require-hashes --requirement scripts/suite90.txt
 	$(BIN)/mikasa-vla list tasks --suite mikasa_vla_90
 
-test: setup  ## run the tests that need neither GPU, network nor much time
+base: setup  ## install what the tasks of MIKASA-Base need, the two in 3D included
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --requirement scripts/base.txt
+
+test: base  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)
 
-test-all: setup  ## run every test this machine can run
+test-all: base  ## run every test this machine can run
 	$(PYTEST) -m "not network and not parity and not peer and not full_size and not suite90"
 
 rehearse: setup  ## write, load and run every policy at its published size: 20 GB of memory, 30 GB of disk

@@ -1,0 +1,132 @@
+"""The levels of the environments with images, one row each."""
+
+from collections.abc import Iterator
+
+from vla_eval.base_tasks.row import BaseTask, Figures
+
+PLAYERS = "vla_eval.base_tasks.players"
+_ENDLESS = "MarcoMeter/endless-memory-gym at a94f2b6 (MIT)"
+
+
+def image_rows() -> Iterator[BaseTask]:
+    """Yield the rows of all families."""
+    yield from _minigrid()
+    yield from _ballet()
+    yield _visual_match()
+    yield _mortar_mayhem()
+    yield _mystery_path()
+
+
+def _minigrid() -> Iterator[BaseTask]:
+    # The official package's S17Random has side 19; so it has here.
+    rows = (
+        ("S7", 7, False, 0.25, 0.49, 0.984),
+        ("S13", 13, False, 0.21, 0.49, 0.992),
+        ("S13Random", 13, True, 0.25, 0.49, 0.993),
+        ("S17Random", 19, True, 0.17, 0.49, 0.996),
+        ("S19", 19, False, None, 0.49, 0.996),
+    )
+    for name, size, random_length, random, memoryless, best in rows:
+        yield BaseTask(
+            name=f"MiniGrid-Memory{name}-v0",
+            family="MiniGrid-Memory",
+            entry_point="vla_eval.base_tasks.minigrid_memory:MiniGridMemoryEnv",
+            kwargs={"size": size, "random_length": random_length},
+            horizon_steps=5 * size**2,
+            memory=("object",),
+            tier="complex image",
+            extra="base",
+            description="Walk to the object that lay in the first room.",
+            remember="1 bit for the length of the hallway",
+            success="The agent stands at the right object.",
+            figures=Figures(
+                random=random, memoryless=memoryless, best=best, source="measured; best: shortest path"
+            ),
+            memoryless=f"{PLAYERS}.minigrid:TurnsLeft",
+            oracle=f"{PLAYERS}.minigrid:Oracle",
+            source="Farama-Foundation/Minigrid at 9092872, release 3.2.0 (Apache-2.0)",
+        )
+
+
+def _ballet() -> Iterator[BaseTask]:
+    rows = (
+        ("Easy", 2, 16, False, 320, 0.43),
+        ("Medium", 4, 16, False, 320, 0.23),
+        ("Hard", 8, 48, False, 1024, 0.08),
+        ("LightEasy", 2, 16, True, 320, 0.43),
+    )
+    for level, n_dancers, delay_steps, is_light, horizon_steps, random in rows:
+        yield BaseTask(
+            name=f"Ballet{level}-v0",
+            family="Ballet",
+            entry_point="vla_eval.base_tasks.ballet:BalletEnv",
+            kwargs={"n_dancers": n_dancers, "delay_steps": delay_steps, "is_light": is_light},
+            horizon_steps=horizon_steps,
+            memory=("sequential", "object"),
+            tier="complex image",
+            description="Watch dancers, then walk to the one whose dance is named.",
+            remember=f"{n_dancers} dances for up to {n_dancers * (15 + delay_steps)} frames",
+            success="The agent comes to the right dancer.",
+            figures=Figures(
+                random=random, memoryless=1 / n_dancers, best=1.0, source="random: measured; others: exact"
+            ),
+            memoryless=f"{PLAYERS}.ballet:AnyDancer",
+            oracle=f"{PLAYERS}.ballet:Oracle",
+            source="jinPrelude/gym-balletenv at e28b56e (Apache-2.0), after Lampinen et al. 2021",
+        )
+
+
+def _visual_match() -> BaseTask:
+    return BaseTask(
+        name="Passive-VisualMatch-v0",
+        family="VisualMatch",
+        entry_point="vla_eval.base_tasks.visual_match:VisualMatchEnv",
+        horizon_steps=60,
+        memory=("object",),
+        tier="complex image",
+        description="See a colour, gather apples, step onto the pad of that colour.",
+        remember="one of 3 colours for 30 steps",
+        success="The first pad stepped on has the colour.",
+        figures=Figures(random=2.9, memoryless=14.3, best=21.0, source="measured"),
+        memoryless=f"{PLAYERS}.visual_match:NearestInView",
+        oracle=f"{PLAYERS}.visual_match:Oracle",
+        source="twni2016/Memory-RL at c9b8b39 (Apache-2.0), after Hung et al. 2019",
+    )
+
+
+def _mortar_mayhem() -> BaseTask:
+    return BaseTask(
+        name="MortarMayhem-v0",
+        family="MortarMayhem",
+        entry_point="vla_eval.base_tasks.mortar_mayhem:MortarMayhemEnv",
+        horizon_steps=274,
+        memory=("capacity", "sequential"),
+        tier="complex image",
+        extra="base",
+        description="See ten commands, then carry them out in time.",
+        remember="10 of 9 symbols in their order, for 40 to 270 steps",
+        success="All ten commands are carried out.",
+        figures=Figures(random=0.023, memoryless=0.03, best=1.0, source="measured; memoryless: a bound"),
+        memoryless=f"{PLAYERS}.walkers:AnyTile",
+        oracle=f"{PLAYERS}.walkers:MortarOracle",
+        source=_ENDLESS,
+    )
+
+
+def _mystery_path() -> BaseTask:
+    return BaseTask(
+        name="MysteryPath-v0",
+        family="MysteryPath",
+        entry_point="vla_eval.base_tasks.mystery_path:MysteryPathEnv",
+        horizon_steps=512,
+        memory=("capacity", "spatial"),
+        tier="complex image",
+        extra="base",
+        description="Find an invisible path by trial, and follow it.",
+        remember="the path and the tiles that failed, for up to 512 steps",
+        success="The end of the path is reached.",
+        figures=Figures(random=0.22, memoryless=None, best=1.82, source="measured; best: the path is known"),
+        memoryless=None,
+        oracle=f"{PLAYERS}.walkers:PathOracle",
+        source=_ENDLESS,
+    )
