@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.specs import EnvSpec, PolicySpec
-from vla_eval.task_state import PrivilegedState, TaskStatus
+from vla_eval.task_state import HiddenState, PrivilegedState, TaskStatus
 
 Stage = Literal["setup", "reset", "step", "inference"]
 """What a worker is busy with; each stage has a time limit of its own."""
@@ -35,7 +35,7 @@ class Observation:
     images: Mapping[str, ImageArray]
     state: Mapping[str, FloatArray]  # name -> (D,) float32, as `EnvSpec.states` describes them
     # the true state of the world; None unless the policy declares that it is privileged
-    privileged: PrivilegedState | None = None
+    privileged: PrivilegedState | HiddenState | None = None
 
     def as_declared(self, spec: PolicySpec) -> "Observation":
         """Return what a policy has declared that it reads: observers may have asked for more.
@@ -77,7 +77,7 @@ class EpisodeStart:
     task: str  # task id, for example `RememberColor3-v0`
     seed: int  # the episode's seed; the environment is reset with it
     run: int  # which of several independent runs (training seeds) this is, from 0
-    instruction: str
+    instruction: str  # empty for a task without one
     horizon_steps: int  # the episode ends after so many control steps
     # the episode's row in a forward pass that it shares with others. Batched results are bit-identical only
     # at a fixed row and batch size, so the plan fixes the row.

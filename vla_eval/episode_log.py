@@ -12,7 +12,7 @@ from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
 from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError, SpecMismatchError
 from vla_eval.records import EpisodeRecord
-from vla_eval.specs import ActionSpec, PolicySpec
+from vla_eval.specs import ActionSpec, EnvSpec, PolicySpec
 from vla_eval.task_state import TaskStatus
 
 TCP_POSE = "tcp_pose"  # the state whose first three numbers are the tool centre point, m
@@ -73,21 +73,22 @@ class EpisodeLog:
             and self.success_step is not None
             and self.n_steps - self.success_step >= steps_after_success
         )
-        return is_won or self.status.fail or self.n_steps >= self.start.horizon_steps
+        return is_won or self.status.fail or self.status.is_over or self.n_steps >= self.start.horizon_steps
 
     def record(self, policy: str, n_action_steps: int, *, stops_at_success: bool) -> EpisodeRecord:
         """Return the record of the finished episode; one that stops at its first success has no known end."""
         status, succeeded = self.status, self.success_step is not None
         has_candidates = status.n_candidates > 0
+        has_end = status.has_success and not (stops_at_success and succeeded)
         return EpisodeRecord(
             task=self.start.task,
             policy=policy,
             n_action_steps=n_action_steps,
             run=self.start.run,
             seed=self.start.seed,
-            outcome="success" if succeeded else "failure",
-            success_once=succeeded,
-            success_at_end=None if stops_at_success and succeeded else status.success,
+            outcome=("success" if succeeded else "failure") if status.has_success else "finished",
+            success_once=succeeded if status.has_success else None,
+            success_at_end=status.success if has_end else None,
             success_step=self.success_step,
             n_steps=self.n_steps,
             target=status.target,
@@ -127,9 +128,9 @@ class EpisodeLog:
             self.digest.update(np.ascontiguousarray(state[name], dtype="<f4").tobytes())
 
 
-def check_start(episode: EpisodeStart, chunking: ChunkingSpec) -> None:
+def check_start(episode: EpisodeStart, chunking: ChunkingSpec, env: EnvSpec) -> None:
     """Raise unless the episode can begin."""
-    if not episode.instruction.strip():
+    if env.is_instructed and not episode.instruction.strip():
         raise MissingInstructionError(
             f"{episode.task}, seed {episode.seed}: the instruction is empty. Give it one in prompts/."
         )

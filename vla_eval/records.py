@@ -13,10 +13,11 @@ from vla_eval.errors import RunFolderError
 from vla_eval.strict.bounds import Count, Distance, Positive, Rate, Seconds
 from vla_eval.strict.json_text import Source, as_dataclass, read_json, read_version
 
-RECORD_VERSION = 1
-"""Raise it when a field changes its meaning; readers refuse versions they do not know."""
+RECORD_VERSION = 2
+"""Raise it when a field changes its meaning; readers refuse versions they do not know. 2: `finished`."""
+READ_VERSIONS = (1, RECORD_VERSION)
 
-Outcome = Literal["success", "failure", "error"]
+Outcome = Literal["success", "failure", "finished", "error"]
 
 LATER_FIELDS = frozenset(
     {
@@ -62,10 +63,11 @@ class EpisodeRecord:
     """The result of one episode. A field that has no meaning for it is None, never 0.
 
     Attributes:
-        outcome: `success` if the success rule held at any step, `failure` if it never did, `error` if
-            the episode could not be run to its end. An error is never a failure.
-        success_once / success_at_end: at any step / at the last step; None for an error, and
-            success_at_end also where the run stops at the first success.
+        outcome: `success` if the success rule held at any step, `failure` if it never did, `finished` in a
+            task without such a rule, `error` if the episode could not be run to its end. An error is never
+            a failure.
+        success_once / success_at_end: at any step / at the last step; None for an error and in a task
+            without a success rule, and success_at_end also where the run stops at the first success.
         success_step: control steps executed when the success rule first held.
         n_steps: control steps executed.
         target, n_candidates, first_choice, first_choice_success, n_wrong_choices: which candidate was
@@ -139,7 +141,7 @@ class EpisodeRecord:
         """
         source = Source(where=where, what="an episode record", remedy=REMEDY, error=RunFolderError)
         data = read_json(line, source)
-        read_version(data, "record_version", RECORD_VERSION, source)
+        read_version(data, "record_version", READ_VERSIONS, source)
         return cls._from_data(data, source)
 
     def check(self, *, where: str) -> None:
@@ -277,8 +279,8 @@ OF_AN_ERROR = tuple(_absent_of_an_error(name) for name in RESULT_FIELDS)
 OF_A_RESULT = (
     Rule(
         ("outcome", "success_once"),
-        "success_once true for the outcome 'success' and false for 'failure'",
-        lambda one: one.success_once is (one.outcome == "success"),
+        "success_once true for the outcome 'success', false for 'failure' and null for 'finished'",
+        lambda one: one.success_once is {"success": True, "failure": False}.get(one.outcome),
     ),
     Rule(
         ("success_once", "success_at_end"),

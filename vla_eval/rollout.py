@@ -80,7 +80,7 @@ def rollout(
     check_compatible(policy.spec, env.spec)
     settings.chunking.check_chunk_size(policy.spec.chunk_size, policy=policy.spec.name)
     for episode in episodes:
-        check_start(episode, settings.chunking)
+        check_start(episode, settings.chunking, env.spec)
     boxes = cue_locator(env, settings.cue_view, policy.spec.cameras)
     loop = _Loop(
         env=env, policy=policy, settings=settings, observers=observers, heartbeat=heartbeat, cue_boxes=boxes

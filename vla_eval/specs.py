@@ -11,12 +11,15 @@ from vla_eval.errors import SpecMismatchError, did_you_mean
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CameraSpec:
-    """One camera: (height_px, width_px, 3) uint8 RGB frames; `fov_rad` is the vertical field of view."""
+    """One camera: (height_px, width_px, 3) uint8 RGB frames; `fov_rad` is the vertical field of view.
+
+    None of an image that no camera took.
+    """
 
     name: str
     height_px: int
     width_px: int
-    fov_rad: float
+    fov_rad: float | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,8 +40,8 @@ class ActionSpec:
     low: tuple[float, ...]
     high: tuple[float, ...]
     control_mode: str
-    gripper_open: float
-    """Value of the last entry that opens the gripper; the opposite sign closes it."""
+    gripper_open: float | None
+    """Value of the last entry that opens the gripper, the opposite sign closes it; None without a gripper."""
 
     def clipped(self, actions: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return actions (…, A), float32, with each number within its bounds."""
@@ -47,7 +50,7 @@ class ActionSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvSpec:
-    """All that one task offers to a policy."""
+    """All that one task offers to a policy; `is_instructed`: whether its episodes have an instruction."""
 
     task: str
     cameras: tuple[CameraSpec, ...]
@@ -55,6 +58,7 @@ class EnvSpec:
     action: ActionSpec
     horizon_steps: int
     control_hz: float
+    is_instructed: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

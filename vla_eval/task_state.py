@@ -5,7 +5,7 @@ Knows nothing of simulators. A learned policy is given none of it.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,8 @@ class TaskStatus:
 
     phase: Phase | None  # the phase at this step; None where the environment does not show it
     success: bool  # the success rule holds at this very step
+    is_over: bool = False  # the rules of the task end the episode here, won or not
+    has_success: bool = True  # whether the task has a success rule
     fail: bool = False  # the episode is lost for good (`strict_choice`, first wrong candidate)
     n_candidates: int = 0  # how many candidates there are; 0 for a task without candidates
     # how many different wrong candidates have been touched in the response phase
@@ -79,6 +81,13 @@ class PrivilegedState:
     def target(self) -> int | None:
         """The right candidate; None for a task without candidates or with several right ones."""
         return _only_one(self.right_candidates)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HiddenState:
+    """What is hidden of an episode without a robot, by name; for scripted controls alone."""
+
+    values: Mapping[str, NDArray[Any]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

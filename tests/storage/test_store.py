@@ -172,7 +172,7 @@ def test_bytes_that_are_no_text_are_named(tmp_path: Path) -> None:
 def test_a_whole_last_line_of_another_version_is_not_thrown_away(tmp_path: Path) -> None:
     with RunFolder.open(tmp_path / "r", describe()):
         pass
-    line = result(1).to_json().replace('"record_version": 1', '"record_version": 99')
+    line = result(1).to_json().replace('"record_version": 2', '"record_version": 99')
     (tmp_path / "r/episodes.jsonl").write_text(line)
     with pytest.raises(RunFolderError, match="record version 99"):
         RunFolder.open(tmp_path / "r", describe())

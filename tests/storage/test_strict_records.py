@@ -110,7 +110,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "an error with a result": ({**NO_RESULT, "outcome": "error", "error": ERROR, "n_steps": 5}, "no result"),
     "a cause of another form": ({**NO_RESULT, "outcome": "error", "error": {"kind": 5}}, "error"),
     "an unknown field": ({"colour": "red"}, "the field 'colour' .there is no such field"),
-    "another version": ({"record_version": 2}, "record version 2, this program reads version 1"),
+    "another version": ({"record_version": 3}, "record version 3, this program reads version 1 and 2"),
     "true for a version": ({"record_version": True}, "record_version True"),
 }
 

@@ -13,9 +13,11 @@ from typing import Any
 import pytest
 
 from tests.waiting import is_alive, wait_until
+from vla_eval.config.environment import EnvSettings
+from vla_eval.envs.factory import slow_modules
 from vla_eval.workers import start as worker_start
 from vla_eval.workers.server import IMPORTS_VARIABLE, import_for_workers
-from vla_eval.workers.start import begin, simulator_modules, worker_context, worker_environment
+from vla_eval.workers.start import begin, worker_context, worker_environment
 
 PARENT = """
 import os, sys, time
@@ -99,8 +101,18 @@ def test_where_there_is_an_nvidia_driver_nothing_is_forked(monkeypatch: pytest.M
 
 
 def test_only_what_takes_long_is_imported_before_the_fork() -> None:
-    assert simulator_modules("fake") == ()
-    assert simulator_modules("maniskill") == ("vla_eval.envs.maniskill",)
+    tasks = (
+        "RememberColor3-v0",
+        "RememberColor5-v0",
+        "mikasa_base/T-Maze-v0",
+        "mikasa_vla/TakeItBack-VLA-v0",
+    )
+    assert slow_modules([EnvSettings(task=tasks[0], simulator="fake")]) == ()
+    assert slow_modules(EnvSettings(task=task) for task in tasks) == (
+        "vla_eval.envs.maniskill",
+        "vla_eval.envs.mikasa_base",
+        "vla_eval.envs.official",
+    )
 
 
 PREPARING = """

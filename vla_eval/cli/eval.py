@@ -21,7 +21,7 @@ from vla_eval.cli.shared.output import add_table_arguments
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.protocol import fill_from_protocol
-from vla_eval.errors import RecipeError, unknown_name
+from vla_eval.errors import RecipeError, check_names, unknown_name
 from vla_eval.storage.shard import shard_folder
 from vla_eval.strict.decoding import set_field
 from vla_eval.workers.needed_files import Needed, shared_folder
@@ -52,6 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "or a flag sets others, and its summary figure below the table",
     )
     _add_run_arguments(parser)
+    parser.add_argument("--suite", metavar="NAME", help="all tasks of a suite: `mikasa_base` …")
     for kind, what in (("video", "an mp4"), ("rrd", "a file for the rerun viewer")):
         parser.add_argument(
             f"--capture-{kind}",
@@ -197,9 +198,21 @@ def _which(text: str, *, flag: str) -> str | int:
     return text
 
 
+def _tasks_of(args: argparse.Namespace) -> list[str]:
+    """Return all tasks of the suite that is named in place of tasks."""
+    from vla_eval.tasks.catalog import SUITES
+
+    if args.tasks is not None:
+        raise RecipeError("--task and --suite: name tasks or a suite, not both.")
+    check_names("suite", [args.suite], SUITES, where="--suite")
+    return list(SUITES[args.suite])
+
+
 def _config(args: argparse.Namespace) -> EvalConfig:
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, RECIPE_FLAGS)
+        if args.suite is not None:
+            data["tasks"] = _tasks_of(args)
         if args.serve:
             data["inference"] = "shared"
         for kind in ("video", "rrd"):

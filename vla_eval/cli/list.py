@@ -3,7 +3,9 @@
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import get_args
 
+from vla_eval.base_tasks.catalog import base_task
 from vla_eval.checkpoints.bases import FIRST_TRAININGS
 from vla_eval.cli.terminal.screen import NARROWEST, filled, screen_width
 from vla_eval.config.dataset import DatasetRecipe
@@ -17,7 +19,7 @@ from vla_eval.evaluation.model_table import ModelTable, is_model_table
 from vla_eval.policies.registry import policy_adapters
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.tasks.catalog import FAMILIES, SUITES, installed_tasks
-from vla_eval.tasks.spec import Suite, TaskSpec
+from vla_eval.tasks.spec import MemoryType, Suite, TaskSpec
 
 Row = Sequence[str]
 Groups = Mapping[str, Sequence[Row]]
@@ -42,7 +44,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--suite",
         choices=tuple(SUITES),
         default="paper",
-        help="which tasks: this package's (paper), or the official package's 90 or original ones",
+        help="which tasks: this package's (paper), the official package's 90 or original ones, MIKASA-Base",
+    )
+    parser.add_argument(
+        "--memory",
+        choices=get_args(MemoryType),
+        metavar="TYPE",
+        help="only tasks that need this type of memory: object, spatial, sequential, capacity …",
     )
 
 
@@ -52,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
     for kind in kinds:
         if len(kinds) > 1:
             print(f"{kind}:")
-        groups = _tasks(args.suite) if kind == "tasks" else _LISTS[kind]()
+        groups = _tasks(args.suite, args.memory) if kind == "tasks" else _LISTS[kind]()
         print_rows(groups, indent="  " if len(kinds) > 1 else "")
     return 0
 
@@ -77,9 +85,11 @@ def print_rows(groups: Groups, *, indent: str = "") -> None:
                 print(filled(last, screen, first=f"{margin}    ", rest=f"{margin}    "))
 
 
-def _tasks(suite: Suite = "paper") -> Groups:
+def _tasks(suite: Suite = "paper", memory: MemoryType | None = None) -> Groups:
     groups: dict[str, list[Row]] = {}
     for spec in SUITES[suite].values():
+        if memory not in (None, *spec.memory_types):
+            continue
         groups.setdefault(spec.split or UNGROUPED, []).append(_task(spec))
     if suite == "paper":
         try:
@@ -90,7 +100,9 @@ def _tasks(suite: Suite = "paper") -> Groups:
 
 
 def _task(spec: TaskSpec) -> Row:
-    cells = (spec.id, f"{spec.horizon_steps} steps", f"{spec.memory} memory")
+    cells = (spec.id, f"{spec.horizon_steps} steps", f"{', '.join(spec.memory_types)} memory")
+    if spec.is_base:
+        return (*cells, base_task(spec.id).tier, spec.description)
     known = "measured" if spec.chance_success is None else f"{spec.chance_success:.2g}"
     chance = () if spec.split else (f"chance {known}",)
     return (*cells, *chance, f"“{instruction_for(spec)}”")

@@ -7,6 +7,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import NamedTuple
 
+from vla_eval.base_tasks.catalog import base_task
 from vla_eval.cli.terminal.screen import filled
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
@@ -65,6 +66,8 @@ def run(args: argparse.Namespace) -> int:
     spec = task_spec(args.name)
     if spec.is_official:
         return _show_official(spec, args.prompt_set)
+    if spec.is_base:
+        return _show_base(spec)
     _print("task", f"{spec.id} (rules version {spec.version}, {spec.memory} memory)")
     _print("asks", spec.description)
     _print("instruction", f"“{instruction_for(spec, args.prompt_set)}” (prompts/{args.prompt_set})")
@@ -164,6 +167,28 @@ def _show_official(spec: TaskSpec, prompt_set: str) -> int:
         _print("waits", "until the choice, every action is replaced by zeros")
     _print("arguments", "env.horizon_steps; env.mug = ycb or stand_in, in the shell games")
     _print("runs in", "the official package: `make suite90`, docs/official_suite.md")
+    return 0
+
+
+def _show_base(spec: TaskSpec) -> int:
+    """Explain a task of MIKASA-Base, whose packages need not be installed."""
+    row = base_task(spec.id)
+    figures = row.figures
+    _print("task", f"{row.gym_id} (rules version {row.version}, {', '.join(row.memory)} memory, {row.tier})")
+    _print("asks", row.description)
+    _print("remember", row.remember)
+    _print("success", row.success or "no natural rule: its score is the return")
+    _print("horizon", f"{row.horizon_steps} steps")
+    known = {"random": figures.random, "memoryless": figures.memoryless, "best": figures.best}
+    _print(
+        "returns", ", ".join(f"{name} {'—' if one is None else f'{one:g}'}" for name, one in known.items())
+    )
+    _print("measured", figures.source)
+    _print("rules", row.source)
+    _print(
+        "needs", f"`make base`, or the extra [{row.extra}]" if row.extra else "nothing more than this package"
+    )
+    _print_whole("next", f"mikasa-vla eval --task {row.gym_id} --policy random memoryless oracle")
     return 0
 
 

@@ -32,7 +32,7 @@ class Instructed(Protocol):
 
     @property
     def instruction(self) -> str | None:
-        """Its own sentence, for prompt sets that have none; None for most tasks."""
+        """Its own sentence, for prompt sets that have none; empty: it has none; None for most tasks."""
 
 
 def load_prompts(prompt_set: str = DEFAULT_PROMPT_SET) -> Recipe[PromptRecipe]:

@@ -1,6 +1,7 @@
 """Make an environment from its settings: alone knows which simulators exist, imports them on first use."""
 
 import importlib
+from collections.abc import Iterable, Mapping
 from typing import cast, get_args
 
 from vla_eval.config.environment import EnvSettings, Simulator
@@ -12,9 +13,16 @@ from vla_eval.lock.switch import own_need
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import check_arguments, offered_by, robot_uid
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.spec import Suite
 
-OURS, OFFICIAL = "vla_eval.envs.maniskill:ManiSkillEnv", "vla_eval.envs.official:OfficialEnv"
-"""What runs our tasks on ManiSkill; those of the official package are its own ManiSkill environments."""
+OFFICIAL = "vla_eval.envs.official:OfficialEnv"
+ENVIRONMENTS: Mapping[Suite, str] = {
+    "paper": "vla_eval.envs.maniskill:ManiSkillEnv",
+    "mikasa_vla_90": OFFICIAL,
+    "mikasa_official": OFFICIAL,
+    "mikasa_base": "vla_eval.envs.mikasa_base:BaseTaskSim",
+}
+"""What runs the tasks of a suite."""
 
 
 def make_env(settings: EnvSettings) -> SimEnv:
@@ -28,8 +36,7 @@ def make_env(settings: EnvSettings) -> SimEnv:
     check_names("simulator", [settings.simulator], get_args(Simulator))
     if settings.simulator == "fake":
         return FakeEnv(settings)
-    place = OFFICIAL if task_spec(settings.task).is_official else OURS
-    module_name, _, attribute = place.partition(":")
+    module_name, _, attribute = ENVIRONMENTS[task_spec(settings.task).suite].partition(":")
     try:
         with own_need():  # SAPIEN runs a program when it is imported
             module = importlib.import_module(module_name)
@@ -43,6 +50,12 @@ def make_env(settings: EnvSettings) -> SimEnv:
     return cast("SimEnv", getattr(module, attribute)(settings))
 
 
+def slow_modules(environments: Iterable[EnvSettings]) -> tuple[str, ...]:
+    """Return what workers that run these environments need and what takes long to import."""
+    places = (ENVIRONMENTS[task_spec(one.task).suite] for one in environments if one.simulator != "fake")
+    return tuple(dict.fromkeys(place.partition(":")[0] for place in places))
+
+
 def describe_env(settings: EnvSettings) -> EnvSpec:
     """Return what the environment of these settings offers to a policy, without starting a simulator.
 
@@ -53,6 +66,10 @@ def describe_env(settings: EnvSettings) -> EnvSpec:
     if settings.simulator == "fake":
         return FakeEnv(settings).spec  # arrays only
     task = task_spec(settings.task)
+    if task.is_base:
+        from vla_eval.envs.mikasa_base import describe_base  # imports gymnasium
+
+        return describe_base(settings)
     if task.is_official:
         check_official(settings, task)
     else:

@@ -72,6 +72,10 @@ class FakeEnv:
     def __init__(self, settings: EnvSettings) -> None:
         task = task_spec(settings.task)
         defaults = _defaults(task)
+        if task.is_base:
+            raise TaskArgumentError(
+                f"simulator=fake: {task.id}: MIKASA-Base runs without a simulator. Leave this field out for it."
+            )
         if task.is_official:
             check_official(settings, task)
         else:

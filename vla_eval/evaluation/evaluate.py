@@ -12,8 +12,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
+from vla_eval.config.evaluation import OPTION_FIELDS
 from vla_eval.config.files import options_of
+from vla_eval.envs.factory import slow_modules
 from vla_eval.errors import TooManyErrorsError
 from vla_eval.evaluation.episode_jobs import EpisodeJob, SetupKey
 from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
@@ -34,7 +35,6 @@ from vla_eval.workers.jobs import Answered
 from vla_eval.workers.load import Load
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerSpec
-from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.evaluation.worker"
 RUNNER = f"{WORKER_MODULE}:EpisodeRunner"
@@ -102,7 +102,7 @@ def evaluate(
     """
     observer, path, plan = observer or EvaluationObserver(), resolved.out, make_plan(resolved)
     if not path.exists():  # else nothing may be left to run
-        resolved.backend.prepare(_modules(resolved.config, plan))
+        resolved.backend.prepare(_modules(plan))
     with RunFolder.open(
         path,
         describe(resolved, plan, command),
@@ -154,12 +154,12 @@ def describe(resolved: ResolvedEvaluation, plan: Plan, command: str) -> RunDescr
     )
 
 
-def _modules(config: EvalConfig, plan: Plan) -> tuple[str, ...]:
+def _modules(plan: Plan) -> tuple[str, ...]:
     """Return the slow imports of workers, except other packages' code, which may not work after a fork."""
     adapters = dict.fromkeys(job.group.adapter for job in plan.jobs)
     if plan.shared:
         adapters[REMOTE_ADAPTER] = None
-    return (WORKER_MODULE, *simulator_modules(config.simulator), *own_modules(adapters))
+    return (WORKER_MODULE, *slow_modules(job.group.env for job in plan.jobs), *own_modules(adapters))
 
 
 def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[EpisodeKey]) -> bool:
@@ -171,7 +171,7 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
         answers=(Finished,),
         timeouts=resolved.config.timeouts,
         logs=logs,
-        preload=_modules(resolved.config, plan),
+        preload=_modules(plan),
     )
     for phase in phases(plan):
         if not JobQueue(phase.jobs, finished=finished).n_episodes:

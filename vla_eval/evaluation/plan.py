@@ -8,9 +8,7 @@ from typing import Any
 
 from vla_eval.checkpoints.execution_fields import ignored_fields
 from vla_eval.checkpoints.notes import (
-    LEROBOT_CHECKPOINTS,
     checkpoint_hashes,
-    known_chunk_size,
     normalization_notes,
     training_seeds,
     training_sentences,
@@ -20,22 +18,31 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
-from vla_eval.cue_view import CueViewSettings, no_cue_locator
+from vla_eval.cue_view import CueViewSettings
 from vla_eval.envs.factory import describe_env
-from vla_eval.errors import RecipeError, TaskArgumentError, some_of
+from vla_eval.errors import RecipeError
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
+from vla_eval.evaluation.plan_checks import (
+    check_base,
+    check_changes,
+    check_chunks,
+    check_devices,
+    check_instruction,
+    check_runs,
+    check_tasks,
+    refuse_doubles,
+    refuse_instruction,
+    steps_of,
+)
 from vla_eval.evaluation.resolve import ResolvedEvaluation, has_weights
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
 from vla_eval.seeding import SeedRange
-from vla_eval.specs import EnvSpec
 from vla_eval.storage.planned import part_of
 from vla_eval.storage.shard import Shard
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.strict.bounds import MAX_EPISODES
-from vla_eval.strict.devices import check_device, refuse_missing_gpu
-from vla_eval.tasks.arguments import longest_wait_steps
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 from vla_eval.wire.metadata import ServerMetadata
@@ -99,18 +106,18 @@ class Plan:
 def make_plan(resolved: ResolvedEvaluation) -> Plan:
     """Plan the episodes of an evaluation, or of its shard; a `VlaEvalError` if anything cannot be run."""
     config, policies = resolved.config, resolved.policies
-    _refuse_instruction(config)
+    refuse_instruction(config)
     tasks = [task_spec(task) for task in config.tasks]
-    _refuse_doubles("tasks", [task.id for task in tasks])
-    _refuse_doubles("policies", [part_of(one.name, task=one.task) for one in policies])
-    _check_tasks(tasks, policies)
-    _check_runs(config, policies)
-    _check_devices(resolved)
+    refuse_doubles("tasks", [task.id for task in tasks])
+    refuse_doubles("policies", [part_of(one.name, task=one.task) for one in policies])
+    check_tasks(tasks, policies)
+    check_runs(config, policies)
+    check_devices(resolved)
     prompts = load_prompts(config.prompt_set)
     servers = {policy.name: policy.server for policy in policies if policy.server is not None}
     shared = resolved.shared
     groups, left_out = _groups_of_all(config, tasks, policies, prompts=prompts, shared=shared)
-    _check_chunks(config, policies)
+    check_chunks(config, policies)
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
     _refuse_too_many(config, groups)
@@ -167,7 +174,8 @@ def _groups_of_all(
             n_slots=config.slots_per_worker,
         )
         offered = describe_env(env)
-        _check_changes(config, task, offered)
+        check_changes(config, task, offered)
+        check_base(config, task)
         on_task = partial(
             EpisodeGroup,
             env=env,
@@ -177,8 +185,12 @@ def _groups_of_all(
         )
         for policy in (policy for policy in policies if policy.task in (None, task.id)):
             check_adapter(policy.value.adapter)
+            check_instruction(policy, offered)
             if policy.value.needs_candidates and not task.has_candidates:
                 left_out.append(f"{policy.name} on {task.id}: it needs candidates, and this task has none")
+                continue
+            if policy.value.adapter in task.lacks:
+                left_out.append(f"{policy.name} on {task.id}: no such player is known for this task")
                 continue
             n_rows = config.inference_max_batch if policy.part(0) in shared else config.slots_per_worker
             groups.extend(_groups(config, task, policy, on_task, n_rows=n_rows))
@@ -227,84 +239,6 @@ def _sentences(
     return {**here, **there}
 
 
-def _check_tasks(tasks: Sequence[TaskSpec], policies: Sequence[PolicyEntry]) -> None:
-    """Refuse a policy with checkpoints for single tasks that has none for one, or also one for all."""
-    for policy in policies:
-        own = [one.task for one in policies if one.name == policy.name]
-        missing = [task.id for task in tasks if None not in own and task.id not in own]
-        if missing:
-            raise RecipeError(
-                f"policies: expected a checkpoint of '{policy.name}' for each task, found those for "
-                f"{some_of(map(str, own))} and none for {some_of(missing)}. Add "
-                f"{policy.name}:{missing[0]}=DIR, or leave the task out."
-            )
-        if None in own and len(own) > 1:
-            raise RecipeError(
-                f"policies: '{policy.name}' is named twice, once for all tasks and once for "
-                f"{some_of(filter(None, own))}. Give the two different names."
-            )
-
-
-def _check_devices(resolved: ResolvedEvaluation) -> None:
-    """Refuse a device that does not exist or is not there, for simulator, renderer or policies."""
-    config = resolved.config
-    recipes = [(one.name, recipe.value) for one in resolved.policies for recipe in one.recipes]
-    asked = {
-        (where := f"policy '{name}': args.device"): check_device(str(recipe.args["device"]), name=where)
-        for name, recipe in recipes
-        if recipe.adapter in LEROBOT_CHECKPOINTS and "device" in recipe.args
-    }
-    if config.simulator != "fake":
-        asked |= {"sim_backend": config.sim_backend, "render.backend": config.render.backend}
-    refuse_missing_gpu(resolved.backend.n_gpus, asked)
-
-
-def _check_changes(config: EvalConfig, task: TaskSpec, env: EnvSpec) -> None:
-    """Refuse changes of what a policy sees or remembers that cannot be made in this task."""
-    view, reset_step = config.cue_view, config.reset_policy_at_step
-    has_phases = task.is_official or longest_wait_steps(task, config.env) > 0
-    if view != "as_shown" and not has_phases:
-        raise TaskArgumentError(
-            f"cue_view={view}: {task.id}: this task has no cue phase in which something could be hidden or "
-            "kept. Leave cue_view out for it."
-        )
-    if CueViewSettings(kind=view).hides and task.is_official:
-        raise no_cue_locator(view, task.id)
-    if reset_step is not None and reset_step >= env.horizon_steps:
-        raise TaskArgumentError(
-            f"reset_policy_at_step={reset_step}: {task.id}: the episode ends after "
-            f"{env.horizon_steps} steps: nothing would be reset. Use a smaller number, or increase "
-            "env.horizon_steps."
-        )
-
-
-def _check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
-    """Refuse a number of runs that a policy of several checkpoints does not have."""
-    for policy in policies:
-        n_checkpoints = len(policy.recipes)
-        if policy.is_by_run and config.runs not in (1, n_checkpoints):
-            raise RecipeError(
-                f"runs: {config.runs}, but policy '{policy.name}' has {n_checkpoints} checkpoints, one per "
-                f"run. Expected {n_checkpoints}, so that the other policies have as many runs, or 1."
-            )
-
-
-def _check_chunks(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
-    """Refuse a policy without weights, and more action steps than a checkpoint or server predicts at once."""
-    for policy in policies:
-        for recipe in policy.recipes:
-            known = known_chunk_size(recipe.value.adapter, recipe.value.args, recipe=recipe.name)
-            chunk_size = known if policy.server is None else policy.server.chunk_size
-            if chunk_size is None:
-                continue
-            for n_action_steps in _steps(config, policy):
-                config.chunking.at(n_action_steps).check_chunk_size(chunk_size, policy=policy.name)
-
-
-def _steps(config: EvalConfig, policy: PolicyEntry) -> tuple[int, ...]:
-    return config.n_action_steps or (policy.value.default_n_action_steps,)
-
-
 def _runs(config: EvalConfig, group: EpisodeGroup) -> Sequence[int]:
     return range(config.runs) if group.checkpoint is None else (group.checkpoint,)
 
@@ -329,14 +263,6 @@ def _recipe_hashes(
     return hashes
 
 
-def _refuse_instruction(config: EvalConfig) -> None:
-    if "instruction" in config.env:
-        raise RecipeError(
-            "env.instruction: a policy's instruction comes from prompt_set. Put the sentence into a file in "
-            "./prompts/ and name that file in prompt_set."
-        )
-
-
 def _refuse_too_many(config: EvalConfig, groups: Sequence[EpisodeGroup]) -> None:
     n_episodes = sum(len(_runs(config, group)) for group in groups) * config.episodes
     if n_episodes > MAX_EPISODES:
@@ -348,17 +274,11 @@ def _refuse_too_many(config: EvalConfig, groups: Sequence[EpisodeGroup]) -> None
         )
 
 
-def _refuse_doubles(kind: str, names: list[str]) -> None:
-    for name in names:
-        if names.count(name) > 1:
-            raise RecipeError(f"{kind}: '{name}' is named twice; records distinguish them by name alone.")
-
-
 def _groups(
     config: EvalConfig, task: TaskSpec, policy: PolicyEntry, on_task: partial[EpisodeGroup], *, n_rows: int
 ) -> Iterable[EpisodeGroup]:
     server = policy.server
-    for n_action_steps, (index, recipe) in product(_steps(config, policy), enumerate(policy.recipes)):
+    for n_action_steps, (index, recipe) in product(steps_of(config, policy, task), enumerate(policy.recipes)):
         args = recipe.value.args
         if server is not None:
             args = {**args, "identity_sha256": digest_of(server.identity())}  # workers compare

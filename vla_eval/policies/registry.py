@@ -47,11 +47,12 @@ POLICIES = {
     "body_memory": "vla_eval.policies.controls.shortcuts:make_body_memory",
     "cue_touch": "vla_eval.policies.controls.shortcuts:make_cue_touch",
     "one_frame": "vla_eval.policies.controls.shortcuts:make_one_frame",
+    "memoryless": "vla_eval.policies.controls.base_players:make_memoryless",
     "lerobot": "vla_eval.policies.lerobot.policy:make_lerobot",
     "remote": "vla_eval.policies.remote.policy:make_remote",
     **{name: target for family in FAMILIES.values() for name, target in family.adapters.items()},
 }
-_SCRIPTED_MODULES = ("vla_eval.policies.controls.scripted:", "vla_eval.policies.controls.shortcuts:")
+_SCRIPTED_MODULES = ("vla_eval.policies.controls.",)
 SCRIPTED = frozenset(name for name, target in POLICIES.items() if target.startswith(_SCRIPTED_MODULES))
 """Those of ours that read no image."""
 PRIVILEGED = frozenset({"oracle", "cue_blind", "tour", "cue_reader", "body_memory", "cue_touch", "one_frame"})

@@ -18,6 +18,7 @@ from vla_eval.tasks.catalog import find_task
 
 CHANCE_POLICY = "cue_blind"
 CEILING_POLICY = "oracle"
+MEMORYLESS_POLICY = "memoryless"
 RANDOM_POLICY = "random"
 TOUR_POLICY = "tour"
 
@@ -76,6 +77,8 @@ def success_of(group: RowEpisodes) -> Success:
     If these are all equal, the episodes of one run give the interval (docs/statistics.md).
     """
     runs = group.runs_with_results
+    if not all(run.has_success for run in runs):
+        return Success(n_runs=len(runs))
     estimate = estimate_runs([run.rate for run in runs])
     if estimate is None:
         return Success()
@@ -185,7 +188,7 @@ def count_pairs(group: RowEpisodes, other: RowEpisodes) -> PairCounts:
     for run in group.runs:
         partner = others.get(run.key, {})
         for seed, record in run.results.items():
-            if seed not in partner:
+            if seed not in partner or record.success_once is None:
                 continue
             first, second = record.trajectory_sha256, partner[seed].trajectory_sha256
             if first is not None and second is not None:

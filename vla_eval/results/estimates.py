@@ -109,6 +109,27 @@ def estimate_runs(run_means: Sequence[float]) -> RunsEstimate | None:
     return RunsEstimate(mean=mean, sem=sem, interval=interval)
 
 
+class MeanReturn(NamedTuple):
+    """A mean of returns and its interval."""
+
+    mean: float
+    interval: Interval
+
+
+def mean_return(runs: Sequence[Sequence[float]]) -> MeanReturn:
+    """Return the mean of returns, none empty, and its 95 % t interval.
+
+    Of one run over its episodes, of several over the run means. A single value, or values that are all equal,
+    have an interval of no width.
+    """
+    values = [math.fsum(run) / len(run) for run in runs] if len(runs) > 1 else list(runs[0])
+    mean = math.fsum(values) / len(values)
+    if min(values) == max(values):
+        return MeanReturn(values[0], Interval(values[0], values[0]))
+    half_width = float(scipy.stats.t.ppf((1 + CONFIDENCE) / 2, len(values) - 1) * scipy.stats.sem(values))
+    return MeanReturn(mean, Interval(mean - half_width, mean + half_width))
+
+
 def mcnemar_exact(counts: PairCounts) -> PairedTest | None:
     """Compare two policies on the same episodes; None without a pair.
 

@@ -67,6 +67,11 @@ class Run:
         return {seed: record for seed, record in self.records.items() if record.outcome != "error"}
 
     @property
+    def has_success(self) -> bool:
+        """Whether its task has a success rule."""
+        return all(record.outcome != "finished" for record in self.records.values())
+
+    @property
     def key(self) -> tuple[int, int]:
         """What distinguishes it from the other runs of its row: index and copy."""
         return self.index, self.copy

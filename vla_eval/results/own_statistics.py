@@ -4,13 +4,15 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+from vla_eval.base_tasks.catalog import base_task
 from vla_eval.errors import some_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.comparison import Evidence, Success
-from vla_eval.results.estimates import wilson_interval
+from vla_eval.results.estimates import mean_return, wilson_interval
 from vla_eval.results.grouping import RowEpisodes
 from vla_eval.results.printed_table import UNDEFINED, Column
 from vla_eval.results.success_table import Row, Statistic
+from vla_eval.tasks.catalog import find_task
 
 
 class Episodes(NamedTuple):
@@ -32,6 +34,15 @@ class Choices(NamedTuple):
     right_if_chose: float | None
     right_if_chose_low: float | None
     right_if_chose_high: float | None
+
+
+class Return(NamedTuple):
+    """Mean return, its 95 % interval, and where it lies between the best without memory and the best."""
+
+    mean: float | None = None
+    ci_low: float | None = None
+    ci_high: float | None = None
+    normalised: float | None = None
 
 
 def rate(value: float | None) -> str:
@@ -80,6 +91,35 @@ def mean_text(mean: float | None, sem: float | None, low: float | None, high: fl
     """Return `0.50 ± 0.10 [0.07, 0.93]`, without the standard error of a single run; or a dash."""
     spread = "" if sem is None else f" ± {sem:.2f}"
     return UNDEFINED if mean is None else f"{mean:.2f}{spread} [{rate(low)}, {rate(high)}]"
+
+
+def _return(of: Evidence) -> Return:
+    """Estimate the mean return of MIKASA-Base; robots' rewards are for training and no score."""
+    spec = find_task(of.episodes.key.task)
+    if spec is None or not spec.is_base or not of.episodes.results:
+        return Return()
+    runs = [
+        [value for one in run.results.values() if (value := one.episode_return) is not None]
+        for run in of.episodes.runs_with_results
+    ]
+    found = mean_return(runs)
+    figures = base_task(spec.id).figures
+    return Return(found.mean, found.interval.low, found.interval.high, figures.normalised(found.mean))
+
+
+def _shown_return(row: Row) -> str:
+    mean, low, high, _ = row[RETURN]
+    return UNDEFINED if mean is None else f"{mean:.3g} [{low:.3g}, {high:.3g}]"
+
+
+def _return_notes(rows: Sequence[Row]) -> Iterator[str]:
+    found = [row for row in rows if row[RETURN].mean is not None]
+    if found:
+        yield (
+            "mean return: with its 95 % t interval, over the episodes of one run or the means of several. "
+            "normalised: (R - R_memoryless) / (R_best - R_memoryless), unclipped, by the constants of the "
+            "task (`mikasa-vla show TASK`); — where the best policy without memory is not known."
+        )
 
 
 def _shown_success(row: Row) -> str:
@@ -162,6 +202,15 @@ CHOICES: Statistic[Choices] = Statistic(
         ),
         Column("right if chose", _shown_right, name="right_if_chose", rank=2, is_extra=True),
     ),
+)
+RETURN: Statistic[Return] = Statistic(
+    estimate=_return,
+    cells=lambda value: {f"return_{name}": number for name, number in value._asdict().items()},
+    columns=(
+        Column("mean return", _shown_return, name="return"),
+        Column("normalised", lambda row: rate(row[RETURN].normalised), name="normalised"),
+    ),
+    notes=_return_notes,
 )
 STEPS: Statistic[float | None] = Statistic(
     estimate=lambda of: _mean(

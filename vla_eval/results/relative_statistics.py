@@ -149,7 +149,7 @@ def _chance_notes(rows: Sequence[Row]) -> Iterator[str]:
 def _has_controls(task: str) -> bool:
     """Whether chance can be measured by `cue_blind`; half of the official 90 tasks have no scripted arm."""
     spec = find_task(task)
-    return spec is None or bool(spec.oracle)
+    return spec is None or (bool(spec.oracle) and not spec.is_base)
 
 
 PAIRED: Statistic[tuple[Comparison | None, ...]] = Statistic(

@@ -6,6 +6,7 @@ from dataclasses import replace
 from vla_eval.errors import ReportError, unknown_name
 from vla_eval.results.comparison import (
     CHANCE_POLICY,
+    MEMORYLESS_POLICY,
     RANDOM_POLICY,
     Evidence,
     compare_with_baselines,
@@ -33,7 +34,7 @@ from vla_eval.tasks.catalog import find_task
 
 __all__ = ["DEFAULT_BASELINES", "FORMATS", "Format", "Row", "Table", "build_table", "render"]
 
-DEFAULT_BASELINES = (CHANCE_POLICY, RANDOM_POLICY)
+DEFAULT_BASELINES = (CHANCE_POLICY, MEMORYLESS_POLICY, RANDOM_POLICY)
 
 
 def build_table(
@@ -41,7 +42,8 @@ def build_table(
 ) -> Table:
     """Build one table of all episodes of the given runs; a folder given twice counts once.
 
-    All policies are compared with `baseline`, by default with `cue_blind` and `random`, if they were run.
+    All policies are compared with `baseline`, by default with those of `DEFAULT_BASELINES`
+    that were run.
     The summary figures of these protocols are added to those that the runs name.
 
     Raises:

@@ -12,7 +12,8 @@ from vla_eval.results.relative_statistics import CEILING, CHANCE, CORRECTED, NO_
 from vla_eval.results.success_table import Row, Statistic
 
 STATISTICS: tuple[Statistic[Any], ...] = (  # Any: each has values of its own type
-    *(own.EPISODES, own.SUCCESS, own.AT_END, own.FIRST_CHOICE, own.CHOICES, own.STEPS, own.INFERENCES),
+    *(own.EPISODES, own.SUCCESS, own.AT_END, own.FIRST_CHOICE, own.CHOICES, own.RETURN),
+    *(own.STEPS, own.INFERENCES),
     *(PAIRED, CHANCE, CEILING, CORRECTED),
 )
 """In the order of the columns of CSV and JSON."""

@@ -10,6 +10,7 @@ from vla_eval.results.latex_preset import CONTROLS
 from vla_eval.results.own_statistics import CHOICES, EPISODES, SUCCESS
 from vla_eval.results.relative_statistics import CHANCE, PAIRED, SMALLEST_SHOWN_P, against_chance
 from vla_eval.results.success_table import Row, Table
+from vla_eval.tasks.catalog import find_task
 
 Finding = Literal["no result", "chance unknown", "beats", "not shown", "worse"]
 
@@ -33,6 +34,9 @@ def verdicts(table: Table) -> list[Verdict]:
     """Return the verdict on each task, in the table's order; the oracle's if only controls were run."""
     found = []
     for task in dict.fromkeys(row.task for row in table.rows):
+        spec = find_task(task)
+        if spec is not None and spec.is_base:
+            continue  # chance is of choices of an arm; `audit --suite mikasa_base` says what needs memory
         rows = [row for row in table.rows if row.task == task]
         learned = [row for row in rows if row.policy not in CONTROLS]
         told = learned or [row for row in rows if row.policy == "oracle"]

@@ -67,16 +67,18 @@ def read_json(text: str | bytes, source: Source, *, non_finite: bool = False) ->
     return data
 
 
-def read_version(data: dict[str, Any], name: str, known: int, source: Source) -> None:  # Any: JSON
-    """Take the format's version, a field of this name, out of the data, or refuse any but the `known` one."""
+def read_version(data: dict[str, Any], name: str, known: int | tuple[int, ...], source: Source) -> None:
+    """Take the format's version, a field of this name, out of JSON, or refuse any but the `known` ones."""
     if name not in data:
         raise source.refuse(f"no field '{name}'", "it is missing")
     version = data.pop(name)
     if type(version) is not int:
         raise source.refuse(f"{name} {shown(version)}", "expected a whole number")
-    if version != known:
+    versions = (known,) if isinstance(known, int) else known
+    if version not in versions:
         raise source.error(
-            f"{source.where}: {name.replace('_', ' ')} {shown(version)}, this program reads version {known}. "
+            f"{source.where}: {name.replace('_', ' ')} {shown(version)}, this program reads "
+            f"version {' and '.join(map(str, versions))}. "
             f"Use the version of mikasa-vla-eval that wrote it."
         )
 

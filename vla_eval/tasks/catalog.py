@@ -11,8 +11,10 @@ from collections.abc import Sequence
 from importlib.metadata import EntryPoint, entry_points
 from typing import get_args
 
+from vla_eval.base_tasks.row import NAMESPACE as NAMESPACE_BASE
 from vla_eval.errors import PluginError, UnknownNameError, unknown_name
 from vla_eval.tasks.arm.arms import FETCH_UID
+from vla_eval.tasks.catalogs.base_catalog import MIKASA_BASE
 from vla_eval.tasks.catalogs.official_catalog import (
     MIKASA_VLA_90,
     NAMESPACE_90,
@@ -124,8 +126,10 @@ FAMILIES = make_families(TASKS)
 OFFICIAL_TASKS: dict[str, TaskSpec] = {**MIKASA_VLA_90, **original_tasks(TASKS.values())}
 """The tasks of the official package, which run only where it is installed."""
 
+_ELSEWHERE = {**OFFICIAL_TASKS, **MIKASA_BASE}
+
 SUITES: dict[Suite, dict[str, TaskSpec]] = {
-    suite: {spec.id: spec for spec in (*TASKS.values(), *OFFICIAL_TASKS.values()) if spec.suite == suite}
+    suite: {spec.id: spec for spec in (*TASKS.values(), *_ELSEWHERE.values()) if spec.suite == suite}
     for suite in get_args(Suite)
 }
 
@@ -153,7 +157,7 @@ def _rows_of(point: EntryPoint) -> Sequence[TaskSpec]:
         raise _unusable(point, f"{type(exc).__name__}: {exc}", "Update or uninstall it") from exc
     rows = found if isinstance(found, list | tuple) else [found]
     for row in rows:
-        if not isinstance(row, TaskSpec) or row.is_official or not TASK_ID.fullmatch(row.id):
+        if not isinstance(row, TaskSpec) or row.suite != "paper" or not TASK_ID.fullmatch(row.id):
             expected = "a TaskSpec of the suite 'paper' with an id such as MyTask-v0, or a list of them"
             raise _unusable(point, f"found {row!r:.200}", f"Let {point.value} be {expected}")
     return rows
@@ -168,7 +172,7 @@ def _unusable(point: EntryPoint, problem: str, advice: str) -> PluginError:
 
 
 def _own(name: str) -> TaskSpec | None:
-    return TASKS.get(name) or FAMILIES.get(name) or OFFICIAL_TASKS.get(name)
+    return TASKS.get(name) or FAMILIES.get(name) or _ELSEWHERE.get(name)
 
 
 def find_task(task_id: str) -> TaskSpec | None:
@@ -192,7 +196,7 @@ def _versions(task_id: str) -> list[str]:
     name = task_id.removeprefix("vla_eval/")
     if _own(name) is not None:
         return []
-    rows = {**TASKS, **OFFICIAL_TASKS}
+    rows = {**TASKS, **_ELSEWHERE}
     return [known for known in rows if VERSION.fullmatch(known.removeprefix(name)) and known.startswith(name)]
 
 
@@ -212,6 +216,8 @@ def task_spec(task_id: str) -> TaskSpec:
         known = [*TASKS, *FAMILIES, *installed_tasks()]
         if task_id.startswith((NAMESPACE_90, NAMESPACE_ORIGINAL)):
             known = list(OFFICIAL_TASKS)
+        if task_id.startswith(NAMESPACE_BASE):
+            known = list(MIKASA_BASE)
         if versions := _versions(task_id):
             raise UnknownNameError(f"there are several tasks '{task_id}': {', '.join(versions)}. Name one.")
         raise unknown_name("task", task_id.removeprefix("vla_eval/"), known)

@@ -22,8 +22,8 @@ MemoryType = Literal[
 """The paper's four types of memory (section on task classification), then six that only the official 90 tasks
 have."""
 
-Suite = Literal["paper", "mikasa_vla_90", "mikasa_official"]
-"""Own tasks, and those that other packages add; the official package's 90; its original ones."""
+Suite = Literal["paper", "mikasa_vla_90", "mikasa_official", "mikasa_base"]
+"""Own tasks, and those that other packages add; the official package's 90; its original ones; MIKASA-Base."""
 
 Split = Literal["short", "medium", "long"]
 LONGEST_SHORT_STEPS, LONGEST_MEDIUM_STEPS = 200, 600  # of the official splits
@@ -48,6 +48,7 @@ class TaskSpec:
     kwargs: Mapping[str, Any] = field(default_factory=dict)
     horizon_steps: int  # number of control steps, at 20 Hz, after which the episode ends
     memory: MemoryType  # the type of memory that it needs, according to the paper
+    other_memory: tuple[MemoryType, ...] = ()  # further ones
     instruction_key: str  # the task's name in `prompts/*.yaml`
     description: str  # one sentence: the goal
     success: str  # one sentence: the success rule
@@ -74,9 +75,12 @@ class TaskSpec:
     other_arms: tuple[str, ...] = ()  # values of `robot_uids` that it takes in addition to the Panda's
     # arguments required to make a task of this row; empty except for a family
     open_arguments: tuple[str, ...] = ()
+    lacks: tuple[
+        str, ...
+    ] = ()  # adapters of controls that this task, unlike others of its suite, has none of
     suite: Suite = "paper"  # the set of tasks that it belongs to
     # its sentence where no prompt set has one under `instruction_key`; a word in braces is filled in by
-    # the environment, per episode
+    # the environment, per episode. Empty: an episode has none.
     instruction: str | None = None
     # `phase_source`, `waits_for_choice`: of an official task: which phases can be read from it, and
     # whether the official wrapper replaces actions by zeros until the choice
@@ -113,7 +117,17 @@ class TaskSpec:
     @property
     def is_official(self) -> bool:
         """Whether it runs in the official package."""
-        return self.suite != "paper"
+        return self.suite in ("mikasa_vla_90", "mikasa_official")
+
+    @property
+    def is_base(self) -> bool:
+        """Whether it is one of MIKASA-Base: without a robot, an instruction and candidates."""
+        return self.suite == "mikasa_base"
+
+    @property
+    def memory_types(self) -> tuple[MemoryType, ...]:
+        """All types of memory that it needs, the main one first."""
+        return (self.memory, *self.other_memory)
 
     @property
     def split(self) -> Split | None:

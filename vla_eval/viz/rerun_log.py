@@ -13,7 +13,7 @@ from vla_eval.oracles.kinematics import FLANGE_M, TCP_M, joint_poses
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import EnvSpec
 from vla_eval.storage.capture_files import capture_stem
-from vla_eval.task_state import PHASES
+from vla_eval.task_state import PHASES, PrivilegedState
 from vla_eval.tasks.objects.item_names import item_names
 from vla_eval.viz.rerun_file import layout, rrd_when_whole, send_curve, set_step
 from vla_eval.viz.tape import EpisodeTape, TapedStep
@@ -127,7 +127,7 @@ def arm_points_m(qpos: FloatArray, tcp_position_m: FloatArray) -> FloatArray | N
 
 def _log_world(stream: rr.RecordingStream, taped: TapedStep) -> None:
     world = taped.result.observation.privileged
-    if world is None:
+    if not isinstance(world, PrivilegedState):
         return
     if len(world.candidate_positions_m):
         indices = range(len(world.candidate_positions_m))

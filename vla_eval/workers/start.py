@@ -20,7 +20,6 @@ from typing import Any  # private parts of multiprocessing
 
 import psutil
 
-from vla_eval.config.environment import Simulator
 from vla_eval.lock.switch import WRITING_VARIABLE, folders_for_workers, lock
 from vla_eval.storage.provenance import nvidia_driver_version
 from vla_eval.workers.children import SAFE_PATH
@@ -81,11 +80,6 @@ def start_server(preload: Sequence[str]) -> None:
 def _start_server() -> None:
     with worker_environment(), contextlib.suppress(OSError):  # which a worker's start will report
         forkserver.ensure_running()
-
-
-def simulator_modules(simulator: Simulator) -> tuple[str, ...]:
-    """Return what workers that run a simulator need and what takes long to import."""
-    return ("vla_eval.envs.maniskill",) if simulator == "maniskill" else ()
 
 
 def begin(

@@ -207,7 +207,7 @@ class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
             self._n_errors += 1
             where = f"{record.policy} on {record.task}, seed {record.seed}, run {record.run}"
             self._bar.write(f"error: {where}: {record.error.kind}: {record.error.message}")
-        else:
+        elif record.success_once is not None:
             self._successes.setdefault(record.policy, []).append(bool(record.success_once))
         note = f"{success_text(self._successes)}errors {self._n_errors}"
         self._bar.advance(n_done=self._n_done, n_steps=record.n_steps or 0, note=note)

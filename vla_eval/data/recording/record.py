@@ -29,6 +29,7 @@ from vla_eval.data.recording.jobs import (
 )
 from vla_eval.data.recording.plan import plan_recording
 from vla_eval.data.recording.seed_queue import SeedQueue, Selection
+from vla_eval.envs.factory import slow_modules
 from vla_eval.errors import RecordingError
 from vla_eval.storage.provenance import collect_environment
 from vla_eval.storage.run_file import RunDescription
@@ -40,7 +41,6 @@ from vla_eval.workers.jobs import Answered, JobList
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerSpec
-from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.recording.worker"
 MAX_TRIES = 2  # of one job, since a machine may hiccup; what fails twice is not an accident
@@ -156,7 +156,7 @@ def record(
     """
     plan = plan_recording(recipe)
     refuse_missing_gpu(backend.n_gpus, {"render.backend": recipe.render.backend})
-    preload = (WORKER_MODULE, *simulator_modules(recipe.simulator))
+    preload = (WORKER_MODULE, *slow_modules(one.group.env for one in plan.tasks))
     if not out.exists():
         backend.prepare(preload)
     part = part and part.of_blocks(recipe.episodes_per_shard, recipe.episodes)

@@ -22,6 +22,7 @@ from vla_eval.data.manifest import (
 )
 from vla_eval.data.recording.record import RecordingObserver
 from vla_eval.data.replaying.episode_check import STATE_TOLERANCE
+from vla_eval.envs.factory import slow_modules
 from vla_eval.errors import DatasetError, RecipeError, RecordingError
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.storage.folders import check_writable
@@ -34,7 +35,6 @@ from vla_eval.workers.jobs import Answered, Job, JobList
 from vla_eval.workers.local import LOCAL
 from vla_eval.workers.messages import DeviceFound, Failed, as_exception
 from vla_eval.workers.process import WorkerSpec
-from vla_eval.workers.start import simulator_modules
 
 WORKER_MODULE = "vla_eval.data.replaying.worker"
 MACHINE_FACTS = ("packages", "python", "platform", "cpu", "mesa", "nvidia_driver")
@@ -115,7 +115,7 @@ def replay(
     observer.on_phase(facts.task, "replaying", n_done=0, n_total=len(jobs))
     size = max(1, min(len(jobs), backend.n_cores if workers == "auto" else workers))
     replayed: list[EpisodeReplayed] = []
-    preload = (WORKER_MODULE, *(simulator_modules(jobs[0].env.simulator) if jobs else ()))
+    preload = (WORKER_MODULE, *slow_modules(job.env for job in jobs))
     spec = WorkerSpec(
         runner=RunnerClass(target=f"{WORKER_MODULE}:ReplayRunner"),
         answers=(EpisodeReplayed,),

@@ -42,11 +42,12 @@ def check_has(condition: bool, context: PolicyContext, does: str, lacks: str) ->
 
 def task_expert(context: PolicyContext) -> Any:  # Any: each family's experts have a protocol of their own
     """Return the scripted expert of the context's task; raise if it has none, as half of the official 90."""
-    module, _, name = task_spec(context.env.task).oracle.partition(":")
-    if not module:
+    row = task_spec(context.env.task)
+    module, _, name = row.oracle.partition(":")
+    if not module or row.is_base:
         raise SpecMismatchError(
             f"policy '{context.name}' needs a scripted expert, and {context.env.task} has none. Leave this "
-            "task out for this policy; `random` and `hold` run on every task."
+            "task out for this policy; `random` runs on every task."
         )
     return getattr(importlib.import_module(module), name)
 
@@ -90,7 +91,7 @@ class ScriptedPolicy:
     def privileged_state(self, window: ObservationWindow) -> PrivilegedState:
         """Return the true state of the world at the last observation; raise if the environment has none."""
         state = window.last.privileged
-        if state is None:
+        if not isinstance(state, PrivilegedState):
             raise SpecMismatchError(
                 f"policy '{self.spec.name}' reads the true state of the world, but the observations of "
                 f"{self._context.env.task} carry none. Make the environment with privileged=True."

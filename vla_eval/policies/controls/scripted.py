@@ -16,6 +16,7 @@ from vla_eval.policies.controls.base import (
     in_any_control_mode,
     task_expert,
 )
+from vla_eval.policies.controls.base_players import PlayerPolicy
 from vla_eval.policies.controls.candidate_controls import (
     CandidateExpert,
     ChoicePolicy,
@@ -88,6 +89,18 @@ class BallPolicy(ScriptedPolicy):
         return ActionChunk(actions=expert.plan(state, window.last.step, self._n_actions))
 
 
+def make_random(context: PolicyContext) -> RandomPolicy | PlayerPolicy:
+    """Make the `random` control."""
+    is_base = task_spec(context.env.task).is_base
+    return PlayerPolicy(context, "random") if is_base else RandomPolicy(context)
+
+
+def make_oracle(context: PolicyContext) -> ScriptedPolicy | TranslatedPolicy | PlayerPolicy:
+    """Make the `oracle` for the task of the context."""
+    is_base = task_spec(context.env.task).is_base
+    return PlayerPolicy(context, "oracle") if is_base else _make_arm_oracle(context)
+
+
 def _maker(mode: Mode, does: str = "") -> Callable[[PolicyContext], ScriptedPolicy | TranslatedPolicy]:
     """Return what makes a control of the expert; one that `does` something with candidates needs some."""
 
@@ -103,10 +116,8 @@ def _maker(mode: Mode, does: str = "") -> Callable[[PolicyContext], ScriptedPoli
     return in_any_control_mode(make)
 
 
-make_random = RandomPolicy
 make_hold = in_any_control_mode(HoldPolicy)
-make_oracle = _maker("oracle")
-"""Makes the `oracle` for the task of the context."""
+_make_arm_oracle = _maker("oracle")
 make_cue_blind = _maker("cue_blind")
 """Makes the `cue_blind` control for the task of the context."""
 make_tour = _maker("tour", "touches one candidate after another")
