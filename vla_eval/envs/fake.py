@@ -74,7 +74,7 @@ class FakeEnv:
         defaults = _defaults(task)
         if task.is_base:
             raise TaskArgumentError(
-                f"simulator=fake: {task.id}: MIKASA-Base runs without a simulator. Leave this field out for it."
+                f"simulator=fake: {task.id}: MIKASA-Base needs no simulator. Leave this field out."
             )
         if task.is_official:
             check_official(settings, task)
