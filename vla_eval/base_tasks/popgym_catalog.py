@@ -12,6 +12,7 @@ from vla_eval.base_tasks.row import BaseTask, Figures, Memory
 
 LEVELS = ("Easy", "Medium", "Hard")
 SOURCE = "proroklab/popgym at 410d5aa, release 1.0.7 (MIT)"
+HIDES_ACTION = ("Battleship", "MineSweeper", "MultiarmedBandit")
 PLAYERS = "vla_eval.base_tasks.players"
 
 
@@ -295,4 +296,5 @@ def popgym_rows() -> Iterator[BaseTask]:
                 memoryless=family.memoryless and f"{PLAYERS}.{family.memoryless}",
                 oracle=f"{PLAYERS}.{family.oracle}",
                 source=SOURCE,
+                hides_action=family.name in HIDES_ACTION,
             )

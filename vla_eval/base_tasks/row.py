@@ -60,6 +60,7 @@ class BaseTask:
         figures: what returns are known.
         memoryless: `module:Class` of the player without memory; None where no good one is known.
         oracle: `module:Class` of the player with perfect memory or the true state.
+        hides_action: what an observation means depends on the last action, which it does not show.
         source: upstream, pinned to a commit, and its licence.
     """
 
@@ -79,6 +80,7 @@ class BaseTask:
     memoryless: str | None
     oracle: str
     source: str
+    hides_action: bool = False
 
     @property
     def gym_id(self) -> str:

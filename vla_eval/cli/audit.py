@@ -27,9 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--task", **{**FLAGS["--task"], "help": "task ids (all of the suite)"})
     which.add_argument(
         "--suite",
-        choices=("paper", "mikasa_vla_90"),
+        choices=("paper", "mikasa_vla_90", "mikasa_base"),
         default="paper",
-        help="all tasks of this package (paper), or the official package's 90",
+        help="all tasks of this package (paper), the official package's 90, or MIKASA-Base",
     )
     parser.add_argument("--control", **MANY, dest="controls", metavar="C", help="only these controls")
     parser.add_argument(
@@ -56,6 +56,8 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.cli.shared.evaluations import evaluate_each
     from vla_eval.cli.shared.output import print_in, print_shard
 
+    if args.suite == "mikasa_base" or any(task.startswith("mikasa_base/") for task in args.tasks or ()):
+        return _run_base(args)
     configs = _configs(args)
     out = shard_folder(args.out, args.shard)
     with backend_of(args) as backend:
@@ -69,16 +71,42 @@ def run(args: argparse.Namespace) -> int:
     return EXIT_EPISODE_ERRORS if done.n_errors else 0
 
 
-def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
-    from vla_eval.audit.evaluations import audit_configs, protocols_of
-    from vla_eval.results.shipped_audit import AuditProtocol
+def _run_base(args: argparse.Namespace) -> int:
+    """Audit MIKASA-Base: its controls and its verdict are others."""
+    from vla_eval.audit.base_audit import base_audit_config, read_base_audit, render_base_audit
+    from vla_eval.cli.shared.evaluations import evaluate_each
+    from vla_eval.cli.shared.output import print_in, print_shard
+
+    tasks, settings = _tasks_and_settings(args)
+    config = base_audit_config(tasks, episodes=args.episodes, workers=args.workers, settings=settings)
+    out = shard_folder(args.out, args.shard)
+    with backend_of(args) as backend:
+        done = evaluate_each([(out / config.name, config)], args, backend=backend)
+    if done.stopped is not None:
+        return done.stopped
+    if args.shard is not None:
+        print_shard(out, args.out, args.shard)
+    else:
+        print_in(args.format, render_base_audit(read_base_audit(config, args.out), args.format))
+    return EXIT_EPISODE_ERRORS if done.n_errors else 0
+
+
+def _tasks_and_settings(args: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, Any]]:
+    """Return the tasks, and the fields that are set, with their types."""
     from vla_eval.tasks.catalog import SUITES
 
     settings: dict[str, Any] = {}  # Any: plain data, checked by `decode` below
     apply_overrides(settings, args.overrides, cls=EvalConfig, free=env_paths(args.overrides))
     # Read strictly, with names of nothing: for the types of what was set.
     checked = decode(EvalConfig, {"name": "x", "tasks": ["x"], "policies": ["x"], **settings}, where="--set")
-    tasks = args.tasks or tuple(SUITES[args.suite])
+    return args.tasks or tuple(SUITES[args.suite]), {name: getattr(checked, name) for name in settings}
+
+
+def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
+    from vla_eval.audit.evaluations import audit_configs, protocols_of
+    from vla_eval.results.shipped_audit import AuditProtocol
+
+    tasks, settings = _tasks_and_settings(args)
     wanted: tuple[AuditProtocol, ...] = ("paper", "strict") if args.protocol == "both" else (args.protocol,)
     return audit_configs(
         tasks,
@@ -86,5 +114,5 @@ def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
         episodes=args.episodes,
         workers=args.workers,
         controls=args.controls,
-        settings={name: getattr(checked, name) for name in settings},
+        settings=settings,
     )
