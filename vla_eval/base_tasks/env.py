@@ -136,12 +136,13 @@ class BaseTaskEnv(gym.Env[Any, Any], ABC):
         """Return the action as the space's own type; a whole number may come as any integer type."""
         space = self.action_space
         if isinstance(space, gym.spaces.Discrete):
-            number = np.asarray(action)
-            if number.size == 1 and number.dtype.kind in "iu" and space.contains(int(number.item())):
-                return int(number.item())
+            # The usual cases first: to ask the space takes longer than a step of a small game.
+            number = action.item() if isinstance(action, np.ndarray) and action.size == 1 else action
+            if isinstance(number, int | np.integer) and 0 <= number - space.start < space.n:
+                return int(number)
         else:
             values = np.asarray(action)
-            whole = space.dtype is not None and np.issubdtype(space.dtype, np.integer)
+            whole = isinstance(space, gym.spaces.MultiDiscrete)
             if values.dtype.kind in ("iu" if whole else "iuf"):
                 values = values.astype(space.dtype)
                 if space.contains(values):

@@ -156,15 +156,14 @@ class PopgymEnv(BaseTaskEnv):
         super().__init__(horizon_steps=horizon_steps, render_mode=render_mode)
         self._game = GAMES[game]
         self.has_success = self._game.success is not None
-        module, _, name = self._game.target.partition(":")
         with warnings.catch_warnings():
             # Of the labyrinths: that they can be solved without memory. docs/base_audit.md says it, too.
             warnings.simplefilter("ignore", DeprecationWarning)
-            make = getattr(importlib.import_module(f"popgym.envs.{module}"), name)
-            self._inner: Inner = make(**level)
+            self._inner: Inner = popgym_class(self._game)(**level)
         self.action_space = self._inner.action_space
         self.observation_space = _without_tuples(self._inner.observation_space)
-        self._ending = Ending(0.0, False)
+        self._is_number = isinstance(self.observation_space, gym.spaces.Discrete)
+        self._total, self._terminated = 0.0, False
         self._seen: Any = None
 
     def true_state(self) -> Level:
@@ -175,28 +174,32 @@ class PopgymEnv(BaseTaskEnv):
         given = int(self.np_random.integers(2**31)) if seed is None else seed
         with _global_generators_as_seeded(given):
             observation, _ = self._inner.reset(seed=given)
-        self._ending = Ending(0.0, False)
+        self._total, self._terminated = 0.0, False
         return self._observed(observation)
 
     def _advance(self, action: Any) -> tuple[Any, float, bool]:
-        observation, reward, terminated, _, _ = self._inner.step(action)
-        self._ending = Ending(self._ending.total + float(reward), bool(terminated))
-        return self._observed(observation), float(reward), bool(terminated)
+        observation, reward, self._terminated, _, _ = self._inner.step(action)
+        self._total += reward
+        return self._observed(observation), reward, self._terminated
 
     def _observed(self, observation: Any) -> Any:
-        if isinstance(self.observation_space, gym.spaces.Discrete):
-            self._seen = int(observation)
-        else:
-            self._seen = np.array(observation, dtype=self.observation_space.dtype)
-        return self._seen if isinstance(self._seen, int) else self._seen.copy()
+        self._seen = observation
+        return int(observation) if self._is_number else np.array(observation, self.observation_space.dtype)
 
     def _is_success(self) -> bool:
         assert self._game.success is not None
-        return bool(self._game.success(self._inner, self._ending))
+        return bool(self._game.success(self._inner, Ending(float(self._total), bool(self._terminated))))
 
     def _picture(self) -> NDArray[np.uint8]:
         cells, lines = self._game.board(self._inner, self._seen)
         return board_picture(cells, lines)
+
+
+def popgym_class(game: Game) -> Callable[..., Inner]:
+    """Import and return the class of a game."""
+    module, _, name = game.target.partition(":")
+    made: Callable[..., Inner] = getattr(importlib.import_module(f"popgym.envs.{module}"), name)
+    return made
 
 
 def _without_tuples(space: gym.Space[Any]) -> gym.Space[Any]:
