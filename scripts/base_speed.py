@@ -2,7 +2,8 @@
 
     python scripts/base_speed.py [NAME ...]
 
-One core; random actions drawn before the clock starts; both sides in one run, interleaved; the best of three.
+One core; both sides as `gymnasium.make` gives them, with random actions drawn before the clock starts, in one
+run, interleaved; the best of three.
 """
 
 import sys
@@ -10,10 +11,11 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import gymnasium
 import numpy as np
 
+import vla_eval.base_tasks.register  # noqa: F401
 from vla_eval.base_tasks.catalog import BASE_TASKS
-from vla_eval.base_tasks.make import make_base_task
 from vla_eval.base_tasks.row import BaseTask
 from vla_eval.errors import MissingDependencyError
 
@@ -25,7 +27,7 @@ def main(names: Sequence[str]) -> None:
     print(f"{'task':38}{'steps/s':>10}{'upstream':>10}{'ratio':>8}")
     for name in names or BASE_TASKS:
         try:
-            ours = make_base_task(name)
+            ours = gymnasium.make(BASE_TASKS[name].gym_id)
         except MissingDependencyError as exc:
             print(f"{name:38}{exc}")
             continue
@@ -67,13 +69,19 @@ def _popgym(row: BaseTask) -> Any:
     from vla_eval.base_tasks.popgym_env import GAMES, popgym_class
 
     arguments = dict(row.kwargs)
-    return popgym_class(GAMES[arguments.pop("game")])(**arguments)
+    game = GAMES[arguments.pop("game")]
+    return _as_made(lambda: popgym_class(game)(**arguments))
 
 
 def _minigrid(row: BaseTask) -> Any:
     from minigrid.envs.memory import MemoryEnv
 
-    return MemoryEnv(max_steps=row.horizon_steps, **row.kwargs)
+    return _as_made(lambda: MemoryEnv(max_steps=row.horizon_steps, **row.kwargs))
+
+
+def _as_made(make: Callable[[], Any]) -> Any:
+    """Return an environment with the wrappers that every made one has."""
+    return gymnasium.make(gymnasium.envs.registration.EnvSpec("upstream-v0", entry_point=make))
 
 
 if __name__ == "__main__":

@@ -142,11 +142,13 @@ class BaseTaskEnv(gym.Env[Any, Any], ABC):
                 return int(number)
         else:
             values = np.asarray(action)
-            whole = isinstance(space, gym.spaces.MultiDiscrete)
-            if values.dtype.kind in ("iu" if whole else "iuf"):
-                values = values.astype(space.dtype)
-                if space.contains(values):
-                    return values
+            if isinstance(space, gym.spaces.MultiDiscrete):
+                counts = space.nvec.tolist()
+                is_one = values.dtype.kind in "iu" and values.shape == space.shape
+                if is_one and all(0 <= number < n for number, n in zip(values.tolist(), counts, strict=True)):
+                    return values.astype(space.dtype)
+            elif values.dtype.kind in "iuf" and space.contains(values.astype(space.dtype)):
+                return values.astype(space.dtype)
         raise InvalidActionError(
             f"{type(self).__name__}: expected an action of {space}, found {action!r:.200}."
         )

@@ -172,7 +172,10 @@ class PopgymEnv(BaseTaskEnv):
 
     def _begin(self, seed: int | None, level: Level | None) -> Any:
         given = int(self.np_random.integers(2**31)) if seed is None else seed
-        with _global_generators_as_seeded(given):
+        guard = (
+            _global_generators_as_seeded(given) if self._game.hidden is _maze else contextlib.nullcontext()
+        )
+        with guard:
             observation, _ = self._inner.reset(seed=given)
         self._total, self._terminated = 0.0, False
         return self._observed(observation)
@@ -212,7 +215,7 @@ def _without_tuples(space: gym.Space[Any]) -> gym.Space[Any]:
 
 @contextlib.contextmanager
 def _global_generators_as_seeded(seed: int) -> Iterator[None]:
-    """Seed Python's and numpy's generators for mazelib and popgym, and give them back as they were."""
+    """Seed Python's generator for mazelib; give it, and numpy's, back as they were."""
     state, numpy_state = random.getstate(), np.random.get_state()
     random.seed(seed)  # noqa: TID251  for the draws of others
     try:

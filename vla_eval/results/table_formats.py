@@ -9,6 +9,7 @@ from vla_eval.errors import ReportError
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.formats import FOR_READING, Format, Preset
 from vla_eval.results.latex_preset import paper_preset
+from vla_eval.results.memory_types import memory_side_tables
 from vla_eval.results.own_statistics import mean_text, rate
 from vla_eval.results.printed_table import UNDEFINED, Column, SideTable, cells_of, csv_text, write_tables
 from vla_eval.results.published.table import paper_side_table, published_side_tables
@@ -76,6 +77,7 @@ def side_tables(table: Table, *, paper: bool = False, published: str | None = No
     """Return the tables below a success table; arguments as for `render`."""
     return [
         *([protocol_side_table(table)] if table.protocols else []),
+        *memory_side_tables(table),
         *([paper_side_table(table)] if paper else []),
         *(published_side_tables(published) if published is not None else []),
     ]
