@@ -31,6 +31,7 @@ LEVELS: dict[str, Callable[[GoldenEpisode], dict[str, Any]]] = {
 SHORTER_HERE = ("MineSweeper", "MemoryCards")
 """popgym 1.0.7 ends MineSweeper a step earlier than the official copy; that of Memory Cards has no limit."""
 
+IN_3D = ("ViZDoom", "MemoryMaze")
 COMPARED = [
     name for name in golden_ids() if name in BASE_TASKS and not name.startswith(("ViZDoom", "MemoryMaze"))
 ]
@@ -43,7 +44,8 @@ def _begin(env: Any, episode: GoldenEpisode, family: str) -> Any:
 
 
 def test_every_id_of_the_golden_values_is_in_the_catalogue_under_its_name() -> None:
-    assert set(golden_ids()) == set(BASE_TASKS)
+    flat = {name for name in golden_ids() if not name.startswith(IN_3D)}
+    assert flat == {name for name in BASE_TASKS if not name.startswith(IN_3D)}
 
 
 @pytest.mark.parametrize("name", COMPARED)

@@ -1,5 +1,6 @@
 """MIKASA-Base in an evaluation: what is recorded, what a table shows, what is refused."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -98,3 +99,15 @@ def test_a_suite_stands_for_its_tasks(capsys: pytest.CaptureFixture[str]) -> Non
     assert "there is no suite 'mikasa_bas'. Did you mean 'mikasa_base'?" in capsys.readouterr().err
     assert main(["eval", "--suite", "mikasa_base", "--task", BIT, "--policy", "oracle"]) == 1
     assert "name tasks or a suite, not both" in capsys.readouterr().err
+
+
+def test_scores_are_also_given_by_type_of_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tasks = [BIT, "mikasa_base/T-Maze-v0", CARDS, NUMPAD]
+    evaluate(_config(tasks=tasks, policies=["oracle"], episodes=2), out=tmp_path / "run")
+    assert main(["report", str(tmp_path / "run"), "--format", "json"]) == 0
+    found = {one["memory"]: one for one in json.loads(capsys.readouterr().out)["memory_types"]}
+    # Both tasks of one bit are solved; that of cards is another type, and Numpad has no score.
+    assert found["object"] == {"memory": "object", "policy": "oracle", "n_tasks": 2, "score": 1.0}
+    assert found["capacity"]["n_tasks"] == 1 and set(found) == {"object", "capacity"}
+    assert main(["report", str(tmp_path / "run")]) == 0
+    assert "**MIKASA-Base by type of memory" in capsys.readouterr().out
