@@ -22,6 +22,8 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.structure.files import File, Files
 
 from scripts.notebooks import as_markdown, read
+from vla_eval.base_tasks.catalog import BASE_TASKS
+from vla_eval.base_tasks.row import BaseTask
 from vla_eval.cli import show
 from vla_eval.cli.main import PROGRAM, build_parser
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET
@@ -34,6 +36,15 @@ DOCUMENTED = re.compile(r"^::: (vla_eval[\w.]*)$", re.MULTILINE)
 NOTEBOOK_LINK = re.compile(r"(\]\([^()\s]+)\.ipynb\)")
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 HELP_COLUMNS = "82"  # what the column of a page shows without scrolling
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """Add the pages on MIKASA-Base's families, which are generated, to the navigation."""
+    pages = [{row.family: _base_page_of(row.family)} for row in _families().values()]
+    for section in config.nav or []:
+        if "MIKASA-Base" in section:
+            section["MIKASA-Base"].append({"The environments": pages})
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -57,6 +68,7 @@ def generated_pages() -> dict[str, str]:
         "changelog.md": (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"),
         **{f"notebooks/{file.stem}.md": as_markdown(read(file)) for file in NOTEBOOKS},
         **{f"reference/{folder}.md": _recipes(folder) for folder in RECIPE_FOLDERS},
+        **{_base_page_of(family): _base_page(family) for family in _families()},
     }
 
 
@@ -93,6 +105,58 @@ def _tasks() -> str:
                 show.run(argparse.Namespace(name=name, prompt_set=DEFAULT_PROMPT_SET))
             lines += [f"### {name}", "", *_printed(printed.getvalue())]
     return "\n".join(lines)
+
+
+def _families() -> dict[str, BaseTask]:
+    """Return family -> its first row."""
+    return {row.family: row for row in reversed(BASE_TASKS.values())}
+
+
+def _base_page_of(family: str) -> str:
+    return f"base/{family.lower().replace('-', '_')}.md"
+
+
+def _base_page(family: str) -> str:
+    """Return the page of a family: picture, rules as the code states them, levels."""
+    rows = [row for row in BASE_TASKS.values() if row.family == family]
+    first = rows[0]
+    module = first.entry_point.partition(":")[0]
+    tree = ast.parse((ROOT / Path(*module.split("."))).with_suffix(".py").read_text(encoding="utf-8"))
+    classes = {
+        node.name: ast.get_docstring(node) or "" for node in tree.body if isinstance(node, ast.ClassDef)
+    }
+    lines = [f"# {family}", "", first.description, ""]
+    if (ROOT / "docs" / "images" / "base" / f"{family}.png").exists():
+        shown = f"{family}: moments of an episode of the oracle, the reset first"
+        lines += [f"![{shown}](../images/base/{family}.png)", ""]
+    entries = dict.fromkeys(row.entry_point.partition(":")[2] for row in rows)
+    for title, text in (
+        ("The environment", ast.get_docstring(tree) or ""),
+        *((n, classes[n]) for n in entries),
+    ):
+        lines += [f"## {title}", "", _as_markdown(text), ""]
+    lines += [
+        "## Levels",
+        "",
+        "| id | horizon | to be remembered | random | memoryless | best |",
+        "|---|--:|---|--:|--:|--:|",
+    ]
+    for row in rows:
+        known = (row.figures.random, row.figures.memoryless, row.figures.best)
+        returns = " | ".join("—" if one is None else f"{one:g}" for one in known)
+        lines.append(f"| `{row.gym_id}` | {row.horizon_steps} | {row.remember} | {returns} |")
+    lines += [
+        "",
+        f"Returns: {first.figures.source}. Memory: {', '.join(first.memory)}; {first.tier} tier.",
+        "",
+    ]
+    lines += [f"Success: {first.success or 'no natural rule, the score is the return.'}", ""]
+    return "\n".join([*lines, f"Rules: {first.source}. [How it runs here](../mikasa_base.md)."])
+
+
+def _as_markdown(text: str) -> str:
+    """Return a docstring with its arguments as a list."""
+    return re.sub(r"^    (\w+): ", r"- `\1`: ", text, flags=re.MULTILINE).replace("Args:\n", "Arguments:\n\n")
 
 
 def _rooms() -> str:
