@@ -58,6 +58,27 @@ def board_picture(cells: Sequence[Sequence[Cell]], lines: Sequence[str] = ()) ->
     return np.asarray(image)
 
 
+Line = tuple[tuple[float, float], tuple[float, float], Color, int]
+"""From, to, colour, width in pixels; x from -1.3 to 1.3, y from -1 to 1, up."""
+
+
+def line_picture(drawn: Sequence[Line], words: Sequence[str] = ()) -> NDArray[np.uint8]:
+    """Draw straight lines and, below them, lines of text; (H, W, 3) uint8."""
+    width, field = MIN_WIDTH_PX, 200
+    image = Image.new("RGB", (width, field + len(words) * LINE_PX + MARGIN_PX), PAPER)
+    draw = ImageDraw.Draw(image)
+
+    def pixel(point: tuple[float, float]) -> tuple[float, float]:
+        return width * (point[0] / 1.3 + 1) / 2, field * (1 - point[1]) / 2
+
+    for start, end, color, width_px in drawn:
+        draw.line((*pixel(start), *pixel(end)), fill=color, width=width_px)
+    font = ImageFont.load_default(LINE_PX - 5)
+    for k, line in enumerate(words):
+        draw.text((MARGIN_PX, field + k * LINE_PX), line, fill=INK, font=font)
+    return np.asarray(image)
+
+
 def enlarged(image: NDArray[np.uint8], factor: int) -> NDArray[np.uint8]:
     """Return an (H, W, 3) image with each pixel `factor` times as large."""
     return np.ascontiguousarray(image.repeat(factor, axis=0).repeat(factor, axis=1))

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.base_tasks import popgym_pictures as pictures
-from vla_eval.base_tasks.drawing import Cell, board_picture
 from vla_eval.base_tasks.env import BaseTaskEnv, Level
 
 ALMOST = 1e-9  # of a sum of rewards
@@ -40,13 +39,13 @@ class Game(NamedTuple):
     Attributes:
         target: `module:Class` in popgym.
         hidden: its hidden state by names.
-        board: what a picture shows; given the environment and the last observation.
+        picture: draws it; given the environment and the last observation.
         success: whether an episode was won; None: there is no natural rule.
     """
 
     target: str
     hidden: Callable[[Inner], Level]
-    board: Callable[[Inner, Any], tuple[list[list[Cell]], list[str]]]
+    picture: Callable[[Inner, Any], NDArray[np.uint8]]
     success: Callable[[Inner, Ending], bool] | None
 
 
@@ -194,8 +193,7 @@ class PopgymEnv(BaseTaskEnv):
         return bool(self._game.success(self._inner, Ending(float(self._total), bool(self._terminated))))
 
     def _picture(self) -> NDArray[np.uint8]:
-        cells, lines = self._game.board(self._inner, self._seen)
-        return board_picture(cells, lines)
+        return self._game.picture(self._inner, self._seen)
 
 
 def popgym_class(game: Game) -> Callable[..., Inner]:

@@ -3,41 +3,54 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from vla_eval.base_tasks.drawing import BAD, GOOD, HIDDEN, INK, MARK, PAPER, SHOWN, Cell
+from vla_eval.base_tasks.drawing import (
+    BAD,
+    GOOD,
+    HIDDEN,
+    INK,
+    MARK,
+    PAPER,
+    SHOWN,
+    Cell,
+    board_picture,
+    line_picture,
+)
 
-Board = tuple[list[list[Cell]], list[str]]
+Picture = NDArray[np.uint8]
 
 RANKS = ("A", "2", "3", "4", "5", "6", "7", "8", "9", "10", "J", "Q", "K")
 SUITS = ("spades", "diamonds", "clubs", "hearts")
-TRACK_CELLS = 15  # of a cart's way
 
 
-def cards(inner: Any, seen: Any) -> Board:
+def cards(inner: Any, seen: Any) -> Picture:
     """Show the card that is seen; of Autoencode whether it watches or answers."""
     name = type(inner).__name__
     if name == "HigherLower":
-        return [[Cell(RANKS[seen], SHOWN)]], ["is the next card higher or lower?"]
+        return board_picture([[Cell(RANKS[seen], SHOWN)]], ["is the next card higher or lower?"])
     if name == "Autoencode":
         mode, suit = (int(number) for number in seen)
         line = f"watch: {SUITS[suit]}" if mode else "name the suits, the last one first"
-        return [[Cell(SUITS[suit][0] if mode else "?", SHOWN if mode else HIDDEN)]], [line]
-    return [[Cell(SUITS[seen][0], SHOWN)]], [f"a card of {SUITS[seen]}"]
+        return board_picture([[Cell(SUITS[suit][0] if mode else "?", SHOWN if mode else HIDDEN)]], [line])
+    return board_picture([[Cell(SUITS[seen][0], SHOWN)]], [f"a card of {SUITS[seen]}"])
 
 
-def counts(inner: Any, seen: Any) -> Board:
+def counts(inner: Any, seen: Any) -> Picture:
     """Show the value dealt and the value asked for."""
     value, query = (str(int(number)) for number in seen)
-    return [[Cell(value, SHOWN), Cell(query, MARK)]], ["left: dealt", "right: how often was it dealt?"]
+    return board_picture(
+        [[Cell(value, SHOWN), Cell(query, MARK)]], ["left: dealt", "right: how often was it dealt?"]
+    )
 
 
-def concentration(inner: Any, seen: Any) -> Board:
+def concentration(inner: Any, seen: Any) -> Picture:
     """Show the table as the player sees it."""
     cells = [Cell("", HIDDEN) if v == inner.facedown_card else Cell(str(v), SHOWN) for v in seen.tolist()]
-    return _rows(cells, 13), [f"{sum(cell.color == SHOWN for cell in cells)} cards face up"]
+    return board_picture(_rows(cells, 13), [f"{sum(cell.color == SHOWN for cell in cells)} cards face up"])
 
 
-def battleship(inner: Any, seen: Any) -> Board:
+def battleship(inner: Any, seen: Any) -> Picture:
     """Show hits and misses, which the player does not see."""
     board = [
         [
@@ -46,10 +59,11 @@ def battleship(inner: Any, seen: Any) -> Board:
         ]
         for row, tries in zip(inner.board.tolist(), inner.guesses.tolist(), strict=True)
     ]
-    return board, ["hit" if seen else "no hit", f"{inner.hits} of {sum(inner.ship_sizes)} found"]
+    found = f"{inner.hits} of {sum(inner.ship_sizes)} found"
+    return board_picture(board, ["hit" if seen else "no hit", found])
 
 
-def minesweeper(inner: Any, seen: Any) -> Board:
+def minesweeper(inner: Any, seen: Any) -> Picture:
     """Show the tiles that were viewed, which the player does not see."""
     viewed = 2
     board = [
@@ -59,16 +73,16 @@ def minesweeper(inner: Any, seen: Any) -> Board:
         ]
         for states, numbers in zip(inner.hidden_grid.tolist(), inner.neighbor_grid.tolist(), strict=True)
     ]
-    return board, [f"{seen} mines around the last tile"]
+    return board_picture(board, [f"mines around the last tile: {seen}"])
 
 
-def bandit(inner: Any, seen: Any) -> Board:
+def bandit(inner: Any, seen: Any) -> Picture:
     """Show whether the last arm paid."""
-    color = GOOD if seen else BAD
-    return [[Cell("+" if seen else "-", color)]], [f"step {inner.num_steps}", f"{inner.num_bandits} arms"]
+    last = Cell("+" if seen else "-", GOOD if seen else BAD) if inner.num_steps else Cell()
+    return board_picture([[last]], [f"step {inner.num_steps}", f"{inner.num_bandits} arms"])
 
 
-def maze(inner: Any, seen: Any) -> Board:
+def maze(inner: Any, seen: Any) -> Picture:
     """Show the maze with what was visited and the agent; the player sees 3 x 3 cells of it."""
     wall, goal = 1, 3
     board = []
@@ -79,30 +93,25 @@ def maze(inner: Any, seen: Any) -> Board:
             color = {wall: INK, goal: GOOD}.get(cell, visited)
             cells.append(Cell("", MARK if (i, j) == tuple(inner.position) else color))
         board.append(cells)
-    return board, []
+    return board_picture(board)
 
 
-def cartpole(inner: Any, seen: Any) -> Board:
+def cartpole(inner: Any, seen: Any) -> Picture:
     """Show cart and pole as they truly are."""
     x, _, theta, _ = (float(number) for number in inner.state)
-    place = int(np.clip((x / inner.x_threshold + 1) / 2 * TRACK_CELLS, 0, TRACK_CELLS - 1))
-    track = [Cell("", MARK if j == place else PAPER) for j in range(TRACK_CELLS)]
-    return [track], [f"cart {x:+.2f} m", f"pole {np.degrees(theta):+.1f} degrees"]
+    place = x / inner.x_threshold  # -1 to 1
+    tip = (place + 0.8 * np.sin(theta), 0.8 * np.cos(theta))
+    cart = ((place - 0.12, 0.0), (place + 0.12, 0.0), INK, 12)
+    lines = (((-1.2, -0.08), (1.2, -0.08), HIDDEN, 2), cart, ((place, 0.0), tip, MARK, 6))
+    return line_picture(lines, [f"cart {x:+.2f} m, pole {np.degrees(theta):+.1f} degrees"])
 
 
-def pendulum(inner: Any, seen: Any) -> Board:
-    """Show where the tip is; up is up."""
+def pendulum(inner: Any, seen: Any) -> Picture:
+    """Show the pendulum; up is up."""
     theta, speed = (float(number) for number in inner.state)
-    size, middle = 7, 3
-    tip = round(middle - 3 * np.cos(theta)), round(middle + 3 * np.sin(theta))
-    board = [
-        [
-            Cell("", MARK if (i, j) == tip else INK if (i, j) == (middle, middle) else PAPER)
-            for j in range(size)
-        ]
-        for i in range(size)
-    ]
-    return board, [f"{np.degrees(theta) % 360:.0f} degrees from upright, {speed:+.1f} rad/s"]
+    tip = (-0.7 * np.sin(theta), 0.7 * np.cos(theta))
+    words = f"{np.degrees(theta) % 360:.0f} degrees from upright, {speed:+.1f} rad/s"
+    return line_picture([((0.0, 0.0), tip, MARK, 10)], [words])
 
 
 def _rows(cells: list[Cell], width: int) -> list[list[Cell]]:
