@@ -10,7 +10,7 @@ from vla_eval.errors import RecipeError, check_names, some_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.shipped_audit import PROTOCOLS, AuditProtocol, Counts, TaskAudit
 from vla_eval.storage.run_folder import read_run
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import robot_task, task_spec
 from vla_eval.tasks.spec import TaskSpec
 
 Kind = Literal["choice", "search", "several", "ball", "cube", "no_choice", "unscripted"]
@@ -45,7 +45,9 @@ def kind_of(task: TaskSpec) -> Kind:
 
 def protocols_of(tasks: Sequence[str], wanted: Sequence[AuditProtocol]) -> tuple[AuditProtocol, ...]:
     """Return the protocols under which tasks are audited: those wanted, or the official tasks' only one."""
-    official = {task: task_spec(task).is_official for task in tasks}
+    official = {
+        task: robot_task(task, does="an audit with an arm's controls is of").is_official for task in tasks
+    }
     if not any(official.values()):
         return tuple(wanted)
     if not all(official.values()):

@@ -55,8 +55,9 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.audit.evaluations import read_audit
     from vla_eval.cli.shared.evaluations import evaluate_each
     from vla_eval.cli.shared.output import print_in, print_shard
+    from vla_eval.tasks.catalog import task_spec
 
-    if args.suite == "mikasa_base" or any(task.startswith("mikasa_base/") for task in args.tasks or ()):
+    if all(task_spec(task).is_base for task in _tasks_and_settings(args)[0]):
         return _run_base(args)
     configs = _configs(args)
     out = shard_folder(args.out, args.shard)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vla_eval.base_tasks.catalog import base_task
+from vla_eval.base_tasks.row import NAMESPACE
 from vla_eval.cli.terminal.screen import filled
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
@@ -61,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Explain what is named, without starting a simulator."""
-    if find_task(args.name) is None:
+    if find_task(args.name) is None and not args.name.startswith(NAMESPACE):
         return _show_folder(Path(args.name)) if os.path.isdir(args.name) else _show_recipes(args.name)
     spec = task_spec(args.name)
     if spec.is_official:

@@ -13,7 +13,7 @@ from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.errors import RecipeError
 from vla_eval.probe.interventions import refuse_own_arguments
 from vla_eval.probe.phases import Phases, divides, fixed_phases
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import robot_task
 from vla_eval.tasks.spec import TaskSpec
 
 Axis = Literal["delay", "cue"]
@@ -92,7 +92,7 @@ def plan_grid(config: EvalConfig, settings: GridSettings) -> Grid:
     worlds: list[GridWorld] = []
     left_out: list[str] = []
     for task in config.tasks:
-        spec = task_spec(task)
+        spec = robot_task(task, does="`probe --grid` changes")
         if spec.candidates is None:
             left_out.append(f"{spec.id}: it has no phases")
             continue

@@ -9,7 +9,7 @@ from vla_eval.config.environment import AS_DESIGNED
 from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.errors import RecipeError
 from vla_eval.probe.worlds import APPEARANCES, AS_DRAWN, Intervention, ProbeSettings, TaskWorlds, World
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import robot_task
 
 OWN_ARGUMENTS = (
     *("swap_cue", "swap_order", "show_cue", "shuffle_cue", "cue_after_steps", "distract_steps"),
@@ -152,7 +152,7 @@ def plan_probe(config: EvalConfig, settings: ProbeSettings) -> Probe:
     worlds: list[World] = []
     left_out: list[str] = []
     for task in config.tasks:
-        spec = task_spec(task)
+        spec = robot_task(task, does="`probe` changes")
         of_task = TaskWorlds(spec=spec, config=config, settings=settings)
         changed: list[World] = []
         for probe in settings.probes:

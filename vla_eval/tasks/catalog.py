@@ -12,7 +12,7 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import get_args
 
 from vla_eval.base_tasks.row import NAMESPACE as NAMESPACE_BASE
-from vla_eval.errors import PluginError, UnknownNameError, unknown_name
+from vla_eval.errors import PluginError, TaskArgumentError, UnknownNameError, unknown_name
 from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.catalogs.base_catalog import MIKASA_BASE
 from vla_eval.tasks.catalogs.official_catalog import (
@@ -221,4 +221,18 @@ def task_spec(task_id: str) -> TaskSpec:
         if versions := _versions(task_id):
             raise UnknownNameError(f"there are several tasks '{task_id}': {', '.join(versions)}. Name one.")
         raise unknown_name("task", task_id.removeprefix("vla_eval/"), known)
+    return spec
+
+
+def robot_task(task_id: str, *, does: str) -> TaskSpec:
+    """Return the row of a task with a robot, for what `does` something that needs one; else as `task_spec`.
+
+    Raises:
+        TaskArgumentError: it is a task of MIKASA-Base.
+    """
+    spec = task_spec(task_id)
+    if spec.is_base:
+        raise TaskArgumentError(
+            f"{spec.id}: {does} a robot's task, and MIKASA-Base has none. Use one of `mikasa-vla list tasks`."
+        )
     return spec

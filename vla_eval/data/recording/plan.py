@@ -20,7 +20,7 @@ from vla_eval.evaluation.episode_jobs import EpisodeGroup, GroupKey
 from vla_eval.features import EncoderSettings
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import robot_task
 from vla_eval.tasks.spec import TaskSpec
 
 
@@ -38,7 +38,7 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
     expert = load_recipe("policies", recipe.expert, PolicyRecipe)
     check_adapter(expert.value.adapter)
     prompts = load_prompts(recipe.prompt_set)
-    specs = [task_spec(task) for task in recipe.tasks]
+    specs = [robot_task(task, does="`record` makes demonstrations of") for task in recipe.tasks]
     return RecordingPlan(
         tasks=tuple(_task_plan(recipe, expert, spec, sentences_of(prompts, spec)[0]) for spec in specs),
         recipe_files={
