@@ -21,7 +21,7 @@ SEED = 1
 
 
 def main(families: Sequence[str]) -> None:
-    """Write a picture per family, of its first level."""
+    """Write a frame per family, of its first level."""
     first = {row.family: row.name for row in reversed(BASE_TASKS.values())}
     FOLDER.mkdir(exist_ok=True)
     for family in families or first:

@@ -117,7 +117,7 @@ def _base_page_of(family: str) -> str:
 
 
 def _base_page(family: str) -> str:
-    """Return the page of a family: picture, rules as the code states them, levels."""
+    """Return the page of a family: frame, rules as the code states them, levels."""
     rows = [row for row in BASE_TASKS.values() if row.family == family]
     first = rows[0]
     module = first.entry_point.partition(":")[0]

@@ -18,7 +18,7 @@ from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
 
 CONTROLS = ("random", "memoryless", "oracle")
-ENOUGH = 0.8
+ENOUGH = 0.9
 """Where a player without memory gets this far from random to the oracle, memory is mostly not needed."""
 N_RESAMPLES, RESAMPLING_SEED = 2000, 0
 

@@ -1,4 +1,4 @@
-"""Readable pictures of games that have none of their own: a board of cells, with lines of text below it."""
+"""Readable frames of games that have none of their own: a board of cells, with lines of text below it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from vla_eval.base_tasks.drawing import GOOD, HIDDEN, SHOWN, Cell, board_picture
 from vla_eval.base_tasks.env import BaseTaskEnv, Level
 
-IN_A_ROW = 10  # cards of a picture
+IN_A_ROW = 10  # cards of a frame
 
 
 class MemoryCardsEnv(BaseTaskEnv):

@@ -1,4 +1,4 @@
-"""What pictures of POPGym's games show: boards of cells, lines of text. They only read the game."""
+"""What frames of POPGym's games show: boards of cells, lines of text. They only read the game."""
 
 from typing import Any
 

@@ -18,7 +18,7 @@ Extra = Literal["", "base", "base-3d"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figures:
-    """Mean returns that are known of a row.
+    """Mean returns that are known for a row.
 
     Attributes:
         random: of uniformly random actions.

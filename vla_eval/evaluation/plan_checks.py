@@ -16,16 +16,24 @@ from vla_eval.strict.devices import check_device, refuse_missing_gpu
 from vla_eval.tasks.arguments import longest_wait_steps
 from vla_eval.tasks.spec import TaskSpec
 
+MEMORYLESS = "memoryless"
+"""Adapter of the one control that is for MIKASA-Base alone."""
 ONE_BY_ONE = (1,)
 """`n_action_steps` of MIKASA-Base."""
 
 
 def check_instruction(policy: PolicyEntry, env: EnvSpec) -> None:
-    """Refuse a robot's policy for a task without a robot."""
+    """Refuse a robot's policy for a task without a robot, and the other way round."""
     if not env.is_instructed and (policy.value.adapter in LEROBOT_CHECKPOINTS or policy.server is not None):
         raise SpecMismatchError(
             f"policy '{policy.name}' is asked with an instruction, and {env.task} has none, nor a "
             "robot. Leave this task out for this policy."
+        )
+    if env.is_instructed and policy.value.adapter == MEMORYLESS:
+        raise SpecMismatchError(
+            f"policy '{policy.name}' is a control of MIKASA-Base; for {env.task} it has to be trained. Run "
+            f"`mikasa-vla finetune --policy {policy.name} --dataset DIR --out RUN`, then `mikasa-vla eval --policy "
+            "RUN`."
         )
 
 

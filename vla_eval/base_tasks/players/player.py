@@ -1,4 +1,4 @@
-"""What plays: a memoryless player, an oracle."""
+"""What acts in: a memoryless player, an oracle."""
 
 from collections.abc import Mapping
 from typing import Any  # observations and actions, as Gymnasium has them
@@ -9,7 +9,7 @@ from vla_eval.base_tasks.env import Level
 
 
 class Player:
-    """Plays one episode after another; everything random comes from the episode's generator.
+    """Acts in one episode after another; everything random comes from the episode's generator.
 
     Attributes:
         arguments: those of the row, which say what level it is.

@@ -72,7 +72,6 @@ def make_memoryless(context: PolicyContext) -> PlayerPolicy:
     """Make the `memoryless` control; raises `SpecMismatchError` where none is known."""
     if not task_spec(context.env.task).is_base:
         raise SpecMismatchError(
-            f"policy '{context.name}' is for the tasks of MIKASA-Base (`mikasa-vla list tasks --suite "
-            f"mikasa_base`); for {context.env.task} use `cue_blind`, `one_frame` or `body_memory`."
+            f"policy '{context.name}' acts in MIKASA-Base, and {context.env.task} is a robot's task."
         )
     return PlayerPolicy(context, "memoryless")
