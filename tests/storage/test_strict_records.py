@@ -71,10 +71,14 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "another first touch": ({"touched_candidates": [0, 2]}, "the first choice first among those touched"),
     "another right one": ({"right_candidates": [1]}, "the target as the only right candidate"),
     "a place twice": ({"candidate_places": [0, 1, 1]}, "a place of its own for each candidate"),
-    "an unknown outcome": ({"outcome": "banana"}, "'success', 'failure' or 'error'"),
+    "an unknown outcome": ({"outcome": "banana"}, "'success', 'failure', 'finished' or 'error'"),
     "a failure that succeeded": (
         {"outcome": "failure"},
-        "success_once true for the outcome 'success' and false for 'failure'",
+        "success_once true for the outcome 'success', false for 'failure' and null for 'finished'",
+    ),
+    "lost without a rule": (
+        {"outcome": "finished", "success_once": False, "success_at_end": None, "success_step": None},
+        "success_once true for the outcome 'success', false for 'failure' and null for 'finished'",
     ),
     "a success that did not": ({"success_once": False}, "success_once true"),
     "a success of which that is unknown": ({"success_once": None}, "success_once true"),

@@ -32,8 +32,8 @@ def check_instruction(policy: PolicyEntry, env: EnvSpec) -> None:
     if env.is_instructed and policy.value.adapter == MEMORYLESS:
         raise SpecMismatchError(
             f"policy '{policy.name}' is a control of MIKASA-Base; for {env.task} it has to be trained. Run "
-            f"`mikasa-vla finetune --policy {policy.name} --dataset DIR --out RUN`, then `mikasa-vla eval --policy "
-            "RUN`."
+            f"`mikasa-vla finetune --policy {policy.name} --dataset DIR --out RUN`, then `mikasa-vla eval "
+            "--policy RUN`."
         )
 
 
