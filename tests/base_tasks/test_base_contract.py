@@ -2,6 +2,7 @@
 
 import random
 import warnings
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -14,6 +15,8 @@ from vla_eval.base_tasks.catalog import BASE_TASKS, base_task
 from vla_eval.base_tasks.make import make_base_task
 from vla_eval.base_tasks.players.play import Kind, player_of
 from vla_eval.errors import InvalidActionError, TaskArgumentError, UnknownNameError
+
+pytestmark = pytest.mark.skipif(find_spec("popgym") is None, reason="needs `make base`")
 
 FIRST = {row.family: name for name, row in reversed(BASE_TASKS.items())}
 IDS = [
@@ -198,3 +201,45 @@ def player_return(name: str, kind: Kind, seed: int) -> float:
 def test_an_unknown_name_is_answered_with_the_closest() -> None:
     with pytest.raises(UnknownNameError, match="Did you mean 'MemoryLengthEasy-v0'"):
         base_task("mikasa_base/MemoryLenghtEasy-v0")
+
+
+def test_the_papers_example_runs_with_our_id() -> None:
+    """Listing "Example code for running MemoryLength-v0", with the id that is predefined."""
+    env_id = "mikasa_base/MemoryLengthEasy-v0"
+    env_kwargs = None
+    seed = 123
+
+    env = gym.make(env_id, env_kwargs)
+
+    obs, _ = env.reset(seed=seed)
+
+    for _ in range(11):
+        action = env.action_space.sample()
+        obs, reward, terminations, truncations, _infos = env.step(action)
+    env.close()
+    assert obs.shape == (3,) and reward in (-1.0, 1.0) and terminations and not truncations
+
+
+def test_another_level_says_its_horizon_and_names_arguments_that_exist() -> None:
+    env = gym.make("mikasa_base/MemoryLengthEasy-v0", n_delay_steps=20, n_bits=2, horizon_steps=21)
+    observation, _ = env.reset(seed=1)
+    assert observation.shape == (4,) and env.spec is not None and env.spec.max_episode_steps == 21
+    with pytest.raises(TaskArgumentError, match="another level needs its horizon_steps"):
+        make_base_task("MemoryLengthEasy-v0", n_delay_steps=20)
+    with pytest.raises(UnknownNameError, match="Did you mean 'n_bits'"):
+        make_base_task("MemoryLengthEasy-v0", n_bit=2, horizon_steps=5)
+
+
+@pytest.mark.parametrize("mode", ["sync", "async"])
+def test_several_run_side_by_side_as_alone(mode: str) -> None:
+    name, n_envs = "mikasa_base/RepeatFirstEasy-v0", 3
+    alone = [gym.make(name) for _ in range(n_envs)]
+    together = gym.make_vec(name, num_envs=n_envs, vectorization_mode=mode)
+    seen, _ = together.reset(seed=5)
+    assert seen.tolist() == [env.reset(seed=5 + index)[0] for index, env in enumerate(alone)]
+    for action in range(4):
+        seen, rewards, *_ = together.step(np.full(n_envs, action))
+        results = [env.step(action) for env in alone]
+        assert seen.tolist() == [result[0] for result in results]
+        assert rewards.tolist() == [result[1] for result in results]
+    together.close()

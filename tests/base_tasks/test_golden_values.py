@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -11,6 +12,8 @@ import pytest
 import vla_eval.base_tasks.register  # noqa: F401
 from tests.base_tasks.golden_episodes import GoldenEpisode, golden_episodes, golden_ids, short_digest
 from vla_eval.base_tasks.catalog import BASE_TASKS
+
+pytestmark = pytest.mark.skipif(find_spec("popgym") is None, reason="needs `make base`")
 
 
 def _visual_match_level(one: GoldenEpisode) -> dict[str, Any]:

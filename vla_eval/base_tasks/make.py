@@ -6,7 +6,9 @@ from typing import Any, cast
 
 from vla_eval.base_tasks.catalog import base_task
 from vla_eval.base_tasks.env import BaseTaskEnv
-from vla_eval.errors import MissingDependencyError
+from vla_eval.errors import MissingDependencyError, TaskArgumentError, check_names
+
+HORIZON = "horizon_steps"
 
 
 def make_base_task(name: str, *, render_mode: str | None = None, **kwargs: Any) -> BaseTaskEnv:
@@ -15,13 +17,20 @@ def make_base_task(name: str, *, render_mode: str | None = None, **kwargs: Any) 
     Args:
         name: `RepeatFirstEasy-v0`, with or without `mikasa_base/`.
         render_mode: `rgb_array`, or None.
-        **kwargs: arguments in place of the row's: another level.
+        **kwargs: arguments in place of the row's: another level, and its `horizon_steps`.
 
     Raises:
         UnknownNameError: there is no such task.
+        TaskArgumentError: another level without its horizon, or an argument that it does not take.
         MissingDependencyError: it needs a package that is not installed.
     """
     row = base_task(name)
+    if kwargs and HORIZON not in kwargs:
+        raise TaskArgumentError(
+            f"{row.gym_id}: {', '.join(kwargs)}: another level needs its {HORIZON}, too; this row's is "
+            f"{row.horizon_steps}."
+        )
+    check_names("argument", kwargs, (HORIZON, *row.kwargs), where=row.gym_id)
     module, _, attribute = row.entry_point.partition(":")
     # Else pygame greets on standard output, where a table may go.
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
