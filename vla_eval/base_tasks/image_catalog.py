@@ -15,6 +15,7 @@ def image_rows() -> Iterator[BaseTask]:
     yield _visual_match()
     yield _mortar_mayhem()
     yield _mystery_path()
+    yield from _two_colors()
 
 
 def _minigrid() -> Iterator[BaseTask]:
@@ -130,3 +131,39 @@ def _mystery_path() -> BaseTask:
         oracle=f"{PLAYERS}.walkers:PathOracle",
         source=_ENDLESS,
     )
+
+
+def _two_colors() -> Iterator[BaseTask]:
+    colour = "Take vests of the pillar's colour, on a floor that hurts."
+    bit = "1 bit for up to 500 steps; one vest shows it again"
+    alive = "The player is alive at the end."
+    rows = (
+        ("Base", 525, colour, bit, alive, Figures(random=None, memoryless=None, best=None, source="")),
+        ("Hard", 525, colour, bit, alive, Figures(random=None, memoryless=None, best=None, source="")),
+        (
+            "Delay1000",
+            575,
+            "See a pillar, stay alive for 2000 tics, then choose the vest of its colour.",
+            "1 bit for 500 steps",
+            "The vest has the pillar's colour.",
+            Figures(random=None, memoryless=None, best=None, source=""),
+        ),
+    )
+    for name, horizon_steps, description, remember, success, figures in rows:
+        yield BaseTask(
+            name=f"ViZDoomTwoColors{name}-v0",
+            family="ViZDoomTwoColors",
+            entry_point="vla_eval.base_tasks.two_colors:TwoColorsEnv",
+            kwargs={"level": name.lower()},
+            horizon_steps=horizon_steps,
+            memory=("object",),
+            tier="complex image",
+            extra="base-3d",
+            description=description,
+            remember=remember,
+            success=success,
+            figures=figures,
+            memoryless=None,
+            oracle=f"{PLAYERS}.two_colors:Oracle",
+            source="griver/memup at d276571 (no licence: rules only, own map), Freedoom by vizdoom (MIT)",
+        )
