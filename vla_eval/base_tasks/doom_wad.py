@@ -1,7 +1,7 @@
 """Write maps for ZDoom without its tools: a WAD with a UDMF text map and compiled ACS scripts.
 
-Formats: UDMF 1.1 in the namespace `zdoom`, the old ACS object ("ACS\\0"), of which ZDoom reads every opcode as
-32 bits. Opcodes and line specials are numbered as in ZDoom's `p_acs.h` and `actionspecials.h`. Knows no game.
+Formats: UDMF 1.1 in the namespace `zdoom`; the old ACS object, of which ZDoom reads every opcode as 32 bits.
+Opcodes and line specials are numbered as in ZDoom's `p_acs.h` and `actionspecials.h`. Knows no game.
 """
 
 import itertools

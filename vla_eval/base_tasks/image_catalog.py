@@ -163,7 +163,7 @@ def _two_colors() -> Iterator[BaseTask]:
             remember=remember,
             success=success,
             figures=figures,
-            memoryless=None,
+            memoryless=f"{PLAYERS}.two_colors:RedInView",
             oracle=f"{PLAYERS}.two_colors:Oracle",
             source="griver/memup at d276571 (no licence: rules only, own map), Freedoom by vizdoom (MIT)",
         )

@@ -55,9 +55,9 @@ class TwoColorsEnv(BaseTaskEnv):
     """Remember the colour of a pillar and take vests of it.
 
     Observation (64, 112, 3) uint8. Action: 0 left, 1 right, 2 forward, 3 back, 4 left and forward, 5 left and
-    back, 6 right and forward, 7 right and back; 4 tics each. The floor costs 8 health every 32 tics, a right vest
-    heals 25, a wrong one costs 17 (green) or 13 (red). Reward 0.01 a tic alive, and 1 if health rose. Death
-    ends the episode. Success: alive at the end.
+    back, 6 right and forward, 7 right and back; 4 tics each. The floor costs 8 health every 32 tics, a right
+    vest heals 25, a wrong one costs 17 (green) or 13 (red). Reward 0.01 a tic alive, and 1 if health rose.
+    Death ends the episode; its last image is the one before. Success: alive at the end.
 
     Delay1000 begins in a room without acid, of which the pillar is all that matters; then 2000 tics of acid
     with medikits; then one vest of each colour. Reward 1 if health rose; the choice pays nothing, as in the
@@ -81,8 +81,9 @@ class TwoColorsEnv(BaseTaskEnv):
     def true_state(self) -> Level:
         """Return what is hidden.
 
-        `is_red` of the pillar; `vests` (n, 3): whether red, x, y; `medikits` (n, 2): x, y; `pose`: x, y, degrees;
-        `health`; `shaping`, the original's other reward so far: 1 for a right vest, -1 for a wrong one.
+        `is_red` of the pillar; `vests` (n, 3): whether red, x, y; `medikits` (n, 2): x, y; `pose`: x, y,
+        degrees; `health`; `shaping`, the original's other reward so far: 1 for a right vest, -1 for a wrong
+        one.
         """
         variable = vizdoom.GameVariable
         place = (variable.POSITION_X, variable.POSITION_Y, variable.ANGLE)
@@ -140,12 +141,9 @@ class TwoColorsEnv(BaseTaskEnv):
 
     def _start(self) -> None:
         """Start the game, unless it runs as this process's own."""
-        if self._game is not None and self._process_id == os.getpid():
-            if self._game.is_running():
-                return
-            self.close()
-        elif self._game is not None:
-            _INHERITED.append(self._game)
+        if self._game is not None and self._process_id == os.getpid() and self._game.is_running():
+            return
+        self.close()
         folder = Path(tempfile.mkdtemp(prefix="two_colors_"))
         self._game, self._process_id = vizdoom.DoomGame(), os.getpid()
         self._finalizer = weakref.finalize(self, _end, self._game, folder, os.getpid())
@@ -156,13 +154,15 @@ class TwoColorsEnv(BaseTaskEnv):
         except _FAILURES as exc:
             self.close()
             raise RenderingError(
-                f"ViZDoom {vizdoom.__version__} could not be started: {exc}. Does `python -c 'import vizdoom; "
-                "vizdoom.DoomGame().init()'` run on this machine?"
+                f"ViZDoom {vizdoom.__version__} could not be started: {exc}. Does this run on this machine: "
+                "python -c 'import vizdoom; vizdoom.DoomGame().init()'"
             ) from exc
 
     def close(self) -> None:
         """End the game's process and remove its folder."""
         if self._game is not None:
+            if self._process_id != os.getpid():
+                _INHERITED.append(self._game)
             self._finalizer()
             self._game = None
         super().close()
@@ -197,7 +197,7 @@ def _configure(game: Any, folder: Path, living_reward: float) -> None:
     game.set_sound_enabled(False)
     game.set_screen_resolution(vizdoom.ScreenResolution.RES_320X180)
     game.set_screen_format(vizdoom.ScreenFormat.RGB24)
-    for drawn in ("hud", "crosshair", "weapon", "decals", "particles"):
+    for drawn in ("hud", "crosshair", "weapon", "decals", "particles", "screen_flashes"):
         getattr(game, f"set_render_{drawn}")(False)
     game.set_objects_info_enabled(True)
     game.set_available_buttons(list(BUTTONS))
@@ -212,7 +212,7 @@ def _end(game: Any, folder: Path, process_id: int) -> None:
 
 
 def resized(image: Image, height: int, width: int) -> Image:
-    """Return (height, width, 3): between the two nearest rows and columns, as OpenCV's bilinear resize does."""
+    """Return (height, width, 3), between the nearest two rows and columns, as OpenCV's bilinear resize."""
     values = image.astype(np.float32)
     for axis, size in enumerate((height, width)):
         n_found = image.shape[axis]

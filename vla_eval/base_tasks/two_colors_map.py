@@ -28,8 +28,7 @@ MAP = "MAP01"
 LOW, HIGH = -768, 512  # where the walls of the acid room are, in both directions
 DRAWN = (fixed(LOW), fixed(HIGH - 1))  # between these a place is drawn, again if nothing fits there
 STILL = ("ANIMATED", b"\xff")
-"""An empty list of animated textures: ZDoom moves the acid by the clock, so that no two images were the same."""
-ACID = 83  # sector special: 8 health every 32 tics
+"""An empty list of animated textures: ZDoom moves them by the clock, and images would not repeat."""
 ACID_OUTLINE = (
     (LOW, LOW),
     (LOW, HIGH),
@@ -40,7 +39,8 @@ ACID_OUTLINE = (
     (HIGH, -520),
     (HIGH, LOW),
 )
-WAITING_ROOM = ((-1568, -128), (-1568, 128), (-992, 128), (-992, -128))
+HEIGHT = 128
+WAITING_ROOM = ((-1568, -128), (-1568, 128), (-864, 128), (-864, -128))
 CHOICE_ROOM = ((576, -128), (576, 128), (1024, 128), (1024, -128))
 CHOICE_VESTS = {False: (928, 64), True: (928, -64)}  # is_red -> place
 ACID_START, CHOICE_START = (-128, -128), (672, 0)  # of Delay1000
@@ -63,6 +63,26 @@ CLASSES = ("GreenArmor", "BlueArmor", "TallGreenColumn", "TallRedColumn", "Medik
 """Strings of the scripts. "Red" is Doom's blue armour, which Freedoom draws red."""
 VEST, PILLAR = {False: 0, True: 1}, {False: 2, True: 3}
 MEDIKIT = 4
+
+
+Outline = tuple[tuple[int, int], ...]
+"""Corners of a room, clockwise."""
+Block = tuple[str, dict[str, object]]
+"""What `text_map` writes."""
+
+
+class Look(NamedTuple):
+    """Textures, light and effect of a room."""
+
+    wall: str
+    floor: str
+    ceiling: str
+    light: int
+    special: int = 0
+
+
+ACID_LOOK = Look("STONE2", "NUKAGE1", "CEIL4_1", 160, special=83)  # 8 health every 32 tics
+DRY_LOOK = Look("STARGR1", "FLOOR5_1", "CEIL3_5", 192)
 
 
 class Pose(NamedTuple):
@@ -105,41 +125,52 @@ def map_file(level: Level) -> bytes:
 
 
 def _text(level: Level) -> bytes:
-    rooms = [(ACID_OUTLINE, ACID)]
-    things = [(PLAYER_START, level.start.x, level.start.y, level.start.degrees, {})]
+    blocks = _room(ACID_OUTLINE, ACID_LOOK, sector=0, first=0)
+    blocks += [_thing(PLAYER_START, level.start)]
     if level.is_delayed:
-        rooms += [(WAITING_ROOM, 0), (CHOICE_ROOM, 0)]
+        n_corners = len(ACID_OUTLINE)
+        for sector, outline in enumerate((WAITING_ROOM, CHOICE_ROOM), 1):
+            blocks += _room(outline, DRY_LOOK, sector=sector, first=n_corners)
+            n_corners += len(outline)
         for is_red, (x, y) in CHOICE_VESTS.items():
+            kind = BLUE_ARMOR if is_red else GREEN_ARMOR
             executes = {"special": Special.ACS_EXECUTE.value, "arg0": VEST_CHOSEN, "arg2": int(is_red)}
-            things.append((BLUE_ARMOR if is_red else GREEN_ARMOR, x, y, 0, executes))
-    blocks: list[tuple[str, dict[str, object]]] = []
-    n_corners = 0
-    for sector, (outline, floor_special) in enumerate(rooms):
-        for k, (x, y) in enumerate(outline):
-            ends = {"v1": n_corners + k, "v2": n_corners + (k + 1) % len(outline)}
-            blocks.append(("vertex", {"x": float(x), "y": float(y)}))
-            blocks.append(("linedef", {**ends, "sidefront": n_corners + k, "blocking": True}))
-            blocks.append(("sidedef", {"sector": sector, "texturemiddle": "STONE2"}))
-        n_corners += len(outline)
-        textures = {"texturefloor": "NUKAGE1" if floor_special else "FLOOR4_8", "textureceiling": "CEIL4_1"}
-        heights = {"heightfloor": 0, "heightceiling": 128, "lightlevel": 160}
-        blocks.append(("sector", {**heights, **textures, "special": floor_special}))
-    always = {**{f"skill{k}": True for k in range(1, 6)}, "single": True}
-    for kind, x, y, degrees, executes in things:
-        place = {"x": float(x), "y": float(y), "angle": degrees, "type": kind}
-        blocks.append(("thing", {**place, **always, **executes}))
+            blocks += [_thing(kind, Pose(x, y, 0), **executes)]
     return text_map(blocks)
+
+
+def _room(outline: Outline, look: Look, *, sector: int, first: int) -> list[Block]:
+    """Return a room; `first`: how many corners, and so lines, there are before it."""
+    blocks: list[Block] = []
+    for k, (x, y) in enumerate(outline):
+        v1, v2 = first + k, first + (k + 1) % len(outline)
+        blocks.append(("vertex", {"x": float(x), "y": float(y)}))
+        blocks.append(("linedef", {"v1": v1, "v2": v2, "sidefront": v1, "blocking": True}))
+        blocks.append(("sidedef", {"sector": sector, "texturemiddle": look.wall}))
+    surfaces = {"texturefloor": look.floor, "textureceiling": look.ceiling, "lightlevel": look.light}
+    heights = {"heightfloor": 0, "heightceiling": HEIGHT}
+    return [*blocks, ("sector", {**heights, **surfaces, "special": look.special})]
+
+
+def _thing(kind: int, pose: Pose, **executes: int) -> Block:
+    place = {"x": float(pose.x), "y": float(pose.y), "angle": pose.degrees, "type": kind}
+    skills = {f"skill{k}": True for k in range(1, 6)}
+    return "thing", {**place, **skills, "single": True, **executes}
 
 
 def _scripts(level: Level) -> list[Script]:
     first: list[int | Label | Jump] = [*_pillar(level)]
     for k in range(N_OF_EACH):
         for is_red in (False, True):
-            first += _placed(VEST[is_red], VEST_TID[is_red], VEST_TAKEN[is_red], int(is_red), name=f"first {k} {is_red}")
+            first += _placed(
+                VEST[is_red], VEST_TID[is_red], VEST_TAKEN[is_red], int(is_red), name=f"first {k} {is_red}"
+            )
     again = Label("again")
     first += [*push(PILLAR_TICS), Op.DELAY, *special(Special.THING_REMOVE, PILLAR_TID), again]
     for is_red in (False, True):
-        first += _placed(VEST[is_red], VEST_TID[is_red], VEST_TAKEN[is_red], int(is_red), name=f"more {is_red}")
+        first += _placed(
+            VEST[is_red], VEST_TID[is_red], VEST_TAKEN[is_red], int(is_red), name=f"more {is_red}"
+        )
         first += [*push(VEST_TICS), Op.DELAY]
     return [
         Script(1, When.OPEN, 0, [*first, Jump(Op.GOTO, again)]),

@@ -17,12 +17,16 @@ TOUCH = 40.0  # between centres, so that a vest is taken
 NEAR = 70.0
 DETOUR = 160.0  # what a wrong vest in the way costs, in map units
 STRAIGHT_DEG, WIDE_DEG = 5.0, 40.0
+RED_MIN, RED_RATIO = 60, 2.0  # of a pixel that counts as red
+WHITE_MIN, WHITE_SPREAD = 100, 60
+FLOOR_ROW = 34  # of the image, whose horizon is above it
+THING_PX, STRAIGHT_PX = 8, 5
 
 Place = NDArray[np.float64]
 
 
 class Oracle(Player):
-    """Walks to the nearest vest of the pillar's colour, or to the nearest medikit; knows where all things are."""
+    """Walks to the nearest vest of the pillar's colour or to the nearest medikit; knows where things are."""
 
     def act(self, observation: Any, state: Level) -> int:
         """Return the action."""
@@ -72,3 +76,28 @@ def _is_behind_block(here: Place, goal: Place) -> bool:
     if (y - BLOCK_Y) * (goal_y - BLOCK_Y) >= 0:
         return False
     return bool(x + (goal_x - x) * (BLOCK_Y - y) / (goal_y - y) > BLOCK_WEST)
+
+
+class RedInView(Player):
+    """Walks to the nearest red thing in view, whatever colour the pillar had; turns left until one is.
+
+    In Delay1000, which has vests in the last room only, it walks to white things, medikits, if none is red.
+    """
+
+    def act(self, observation: Any, state: Level) -> int:
+        """Return the action."""
+        low, middle, high = np.moveaxis(np.sort(observation.astype(np.int64), axis=-1), -1, 0)
+        is_red = (high == observation[..., 0]) & (high > RED_MIN) & (high > RED_RATIO * middle)
+        is_white = (low > WHITE_MIN) & (high - low < WHITE_SPREAD)
+        is_white[:FLOOR_ROW] = False
+        rows, columns = np.nonzero(is_red)
+        if not len(rows) and self.arguments["level"] == "delay1000":
+            rows, columns = np.nonzero(is_white)
+        if not len(rows):
+            return LEFT
+        nearest = columns[rows.argmax()]  # the lowest in the image
+        of_it = columns[np.abs(columns - nearest) <= THING_PX]
+        error = float(of_it.mean()) - (observation.shape[1] - 1) / 2
+        if abs(error) < STRAIGHT_PX:
+            return FORWARD
+        return LEFT_FORWARD if error < 0 else RIGHT_FORWARD
