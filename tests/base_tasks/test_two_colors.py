@@ -1,9 +1,12 @@
 """ViZDoom-Two-Colors: episodes of the original repeat from their seed, by health, place and reward."""
 
+import contextlib
 import json
 import os
+import shutil
 import subprocess
 import sys
+import time
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -214,6 +217,41 @@ def _played(env: Any, others: list[Any]) -> list[bytes]:
             one.step(7 - k % 8)
         images.append(env.step(k % 8)[0].tobytes())
     return images
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="only setpriv ties a game to its process")
+def test_a_process_that_is_killed_takes_its_game_with_it() -> None:
+    code = (
+        "import time; from vla_eval.base_tasks.make import make_base_task\n"
+        f"env = make_base_task({BASE!r}); env.reset(seed=0); print('ready', flush=True); time.sleep(60)"
+    )
+    path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
+    environment = {**os.environ, "PYTHONPATH": path}
+    with subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stdout.readline() == b"ready\n"
+        (game,) = _children(process.pid)
+        assert b"vizdoom" in Path(f"/proc/{game}/cmdline").read_bytes()
+        process.kill()
+    deadline = time.monotonic() + 20
+    while _is_alive(game):
+        assert time.monotonic() < deadline, "the game runs on"
+        time.sleep(0.05)
+
+
+def _children(process_id: int) -> list[str]:
+    running = [path.name for path in Path("/proc").iterdir() if path.name.isdigit()]
+    return [one for one in running if _state_and_parent(one)[1] == str(process_id)]
+
+
+def _is_alive(process_id: str) -> bool:
+    """Whether a process runs; one that has ended may stay in the table until somebody asks for its status."""
+    return _state_and_parent(process_id)[0] not in "ZX"
+
+
+def _state_and_parent(process_id: str) -> list[str]:
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return Path(f"/proc/{process_id}/stat").read_text().rsplit(")", 1)[1].split()[:2]
+    return ["X", ""]
 
 
 def test_a_map_is_the_same_file_every_time() -> None:

@@ -48,6 +48,8 @@ ACTIONS = (
 VESTS = {"GreenArmor": 0, "BlueArmor": 1}
 """Class of Doom -> whether it is red here."""
 
+KILLED_WITH_US = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
+
 Image = NDArray[np.uint8]
 
 
@@ -182,10 +184,10 @@ _INHERITED: list[Any] = []
 def _configure(game: Any, folder: Path, living_reward: float) -> None:
     program = Path(vizdoom.__file__).parent
     # The game makes a folder where it is started; the working directory of this process is not its to fill.
+    # It would outlive a process that is killed, were there not setpriv, which most Linux systems have.
+    started = shlex.join(["exec", *KILLED_WITH_US, str(program / "vizdoom")])
     starter = folder / "start"
-    starter.write_text(
-        f'#!/bin/sh\ncd {shlex.quote(str(folder))} && exec {shlex.quote(str(program / "vizdoom"))} "$@"\n'
-    )
+    starter.write_text(f'#!/bin/sh\ncd {shlex.quote(str(folder))} && {started} "$@"\n')
     starter.chmod(0o700)
     game.set_vizdoom_path(str(starter))
     game.set_doom_game_path(str(program / "freedoom2.wad"))

@@ -27,8 +27,6 @@ from vla_eval.base_tasks.doom_wad import (
 MAP = "MAP01"
 LOW, HIGH = -768, 512  # where the walls of the acid room are, in both directions
 DRAWN = (fixed(LOW), fixed(HIGH - 1))  # between these a place is drawn, again if nothing fits there
-STILL = ("ANIMATED", b"\xff")
-"""An empty list of animated textures: ZDoom moves them by the clock, and images would not repeat."""
 ACID_OUTLINE = (
     (LOW, LOW),
     (LOW, HIGH),
@@ -121,7 +119,7 @@ def map_file(level: Level) -> bytes:
     """Return the WAD of a level. It has no nodes: ZDoom builds them."""
     scripts = _delayed_scripts(level) if level.is_delayed else _scripts(level)
     lumps = (("TEXTMAP", _text(level)), ("BEHAVIOR", behavior(scripts, CLASSES)), ("ENDMAP", b""))
-    return wad([STILL, (MAP, b""), *lumps])
+    return wad([(MAP, b""), *lumps])
 
 
 def _text(level: Level) -> bytes:
