@@ -21,12 +21,13 @@ from vla_eval.base_tasks.catalog import BASE_TASKS
 from vla_eval.base_tasks.doom_wad import Jump, Label, Op, Script, When, behavior, push
 from vla_eval.base_tasks.make import make_base_task
 from vla_eval.base_tasks.players.two_colors import Oracle
+from vla_eval.lock.switch import locked
 
 pytest.importorskip("vizdoom", reason="ViZDoom-Two-Colors needs vizdoom (extra base-3d)")
 
 BASE, HARD, DELAYED = (f"ViZDoomTwoColors{level}-v0" for level in ("Base", "Hard", "Delay1000"))
 IDS = (BASE, HARD, DELAYED)
-FORWARD, BACK = 2, 3
+FORWARD = 2
 IS_RED_OF = {"GreenArmor": 0.0, "BlueArmor": 1.0}
 
 
@@ -161,6 +162,7 @@ PLAYS = f"""
 import hashlib, sys, time
 from vla_eval.base_tasks.make import make_base_task
 from vla_eval.base_tasks.players.two_colors import Oracle
+from vla_eval.lock.switch import locked
 env = make_base_task({HARD!r})
 digest = hashlib.sha256(env.reset(seed=3)[0].tobytes())
 for k in range(40):
@@ -220,22 +222,24 @@ def _played(env: Any, others: list[Any]) -> list[bytes]:
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="only setpriv ties a game to its process")
-def test_a_process_that_is_killed_takes_its_game_with_it() -> None:
+def test_a_process_that_is_killed_takes_its_game_with_it(tmp_path: Path) -> None:
     code = (
         "import time; from vla_eval.base_tasks.make import make_base_task\n"
         f"env = make_base_task({BASE!r}); env.reset(seed=0); print('ready', flush=True); time.sleep(60)"
     )
     path = os.pathsep.join([str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path}
+    environment = {**os.environ, "TMPDIR": str(tmp_path), "PYTHONPATH": path}
     with subprocess.Popen([sys.executable, "-c", code], env=environment, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None and process.stdout.readline() == b"ready\n"
         (game,) = _children(process.pid)
-        assert b"vizdoom" in Path(f"/proc/{game}/cmdline").read_bytes()
+        words = Path(f"/proc/{game}/cmdline").read_text().split("\0")
         process.kill()
     deadline = time.monotonic() + 20
     while _is_alive(game):
-        assert time.monotonic() < deadline, "the game runs on"
+        assert time.monotonic() < deadline, "the game still runs"
         time.sleep(0.05)
+    for left in Path("/dev/shm").glob(f"ViZDoom*{words[words.index('+viz_instance_id') + 1]}"):
+        left.unlink()
 
 
 def _children(process_id: int) -> list[str]:
@@ -252,6 +256,14 @@ def _state_and_parent(process_id: str) -> list[str]:
     with contextlib.suppress(FileNotFoundError, ProcessLookupError):
         return Path(f"/proc/{process_id}/stat").read_text().rsplit(")", 1)[1].split()[:2]
     return ["X", ""]
+
+
+def test_a_game_starts_and_ends_where_only_named_places_may_be_written() -> None:
+    with locked():
+        env = make_base_task(BASE)
+        env.reset(seed=0)
+        env.step(FORWARD)
+        env.close()
 
 
 def test_a_map_is_the_same_file_every_time() -> None:

@@ -48,6 +48,7 @@ ACTIONS = (
 VESTS = {"GreenArmor": 0, "BlueArmor": 1}
 """Class of Doom -> whether it is red here."""
 
+FOLDER_PREFIX = "mikasa-vla-doom-"  # what begins so may be written (vla_eval.lock)
 KILLED_WITH_US = ("setpriv", "--pdeathsig", "KILL") if shutil.which("setpriv") else ()
 
 Image = NDArray[np.uint8]
@@ -146,7 +147,7 @@ class TwoColorsEnv(BaseTaskEnv):
         if self._game is not None and self._process_id == os.getpid() and self._game.is_running():
             return
         self.close()
-        folder = Path(tempfile.mkdtemp(prefix="two_colors_"))
+        folder = Path(tempfile.mkdtemp(prefix=FOLDER_PREFIX))
         self._game, self._process_id = vizdoom.DoomGame(), os.getpid()
         self._finalizer = weakref.finalize(self, _end, self._game, folder, os.getpid())
         (folder / "map.wad").write_bytes(maps.map_file(self._level))
