@@ -266,6 +266,18 @@ def test_a_game_starts_and_ends_where_only_named_places_may_be_written() -> None
         env.close()
 
 
+def test_an_image_is_made_smaller_by_interpolation_at_the_middle_of_the_new_pixels() -> None:
+    from vla_eval.base_tasks.two_colors import resized
+
+    ramp = np.zeros((100, 250, 3), np.uint8)
+    ramp[..., 0] = np.arange(250)
+    ramp[..., 1] = np.arange(100)[:, None]
+    small = resized(ramp, 40, 100)  # 2.5 old pixels for a new one
+    # The middle of new pixel k is at 2.5 (k + 1/2) - 1/2 of the old ones; a ramp has that value there.
+    assert np.abs(small[7, :, 0] - (2.5 * np.arange(100) + 0.75)).max() <= 0.5
+    assert np.abs(small[:, 7, 1] - (2.5 * np.arange(40) + 0.75)).max() <= 0.5
+
+
 def test_a_map_is_the_same_file_every_time() -> None:
     for level in maps.LEVELS.values():
         assert maps.map_file(level) == maps.map_file(level)
