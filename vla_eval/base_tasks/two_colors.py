@@ -2,9 +2,10 @@
 
 Rules: griver/memup at d276571 (no licence: rules and measured numbers only; nothing of its map files) and
 https://github.com/CognitiveAISystems/MIKASA-Base/blob/ac81b6f/mikasa_base/ViZDoom_Two_Colors/env/env_vizdoom.py.
-The map and its scripts are made here, `two_colors_map.py`. A seed gives the episode that it gives there: health,
-position and reward of each step are equal in all recorded episodes. Not shown by one, and so by the rules alone:
-the later medikits and the last room of Delay1000. Images depend on the Freedoom of the installed vizdoom.
+The map and its scripts are made here, `two_colors_map.py`. A seed gives the episode that it gives there:
+health, position and reward of each step are equal in all recorded episodes. No recorded episode shows the
+later medikits and the last room of Delay1000: they follow the rules alone. Images depend on the Freedoom of
+the installed vizdoom.
 """
 
 import contextlib
