@@ -44,6 +44,11 @@ def check_base(config: EvalConfig, task: TaskSpec) -> None:
             f"n_action_steps: {list(config.n_action_steps or ())}: {task.id}: expected 1: a "
             "policy has to see what each action brought. Leave n_action_steps out."
         )
+    if task.is_base and config.chunking.delay_steps:
+        raise RecipeError(
+            f"chunking.delay_steps: {task.id}: no action of it holds still, so that none can take the place of one "
+            "that is late. Leave chunking.delay_steps out."
+        )
 
 
 def check_tasks(tasks: Sequence[TaskSpec], policies: Sequence[PolicyEntry]) -> None:
