@@ -46,7 +46,7 @@ def check_base(config: EvalConfig, task: TaskSpec) -> None:
         )
     if task.is_base and config.chunking.delay_steps:
         raise RecipeError(
-            f"chunking.delay_steps: {task.id}: no action of it holds still, so that none can take the place of one "
+            f"chunking.delay_steps: {task.id}: no action holds still, so that none can take the place of one "
             "that is late. Leave chunking.delay_steps out."
         )
 
