@@ -108,8 +108,9 @@ def _tasks() -> str:
 
 
 def _families() -> dict[str, BaseTask]:
-    """Return family -> its first row."""
-    return {row.family: row for row in reversed(BASE_TASKS.values())}
+    """Return family -> its first row, in the order of the names."""
+    first = {row.family: row for row in reversed(BASE_TASKS.values())}
+    return {family: first[family] for family in sorted(first)}
 
 
 def _base_page_of(family: str) -> str:
