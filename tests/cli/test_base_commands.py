@@ -17,6 +17,7 @@ TASK = "mikasa_base/T-Maze-v0"
             ["audit", "--task", TASK, "RememberColor3-v0"],
             "an audit with an arm's controls is of a robot's task",
         ),
+        (["check", "random", "--task", TASK], "`check` gives a policy the observations of a robot's task"),
         (["show", "mikasa_base/T-Maz-v0"], "Did you mean 'mikasa_base/T-Maze-v0'?"),
         (["eval", "--task", TASK, "--policy", "oracle", "--set", "simulator=fake"], "needs no simulator"),
     ],
@@ -24,7 +25,7 @@ TASK = "mikasa_base/T-Maze-v0"
 def test_what_needs_a_robot_is_refused_in_one_message(
     command: list[str], said: str, capsys: pytest.CaptureFixture[str], tmp_path: object
 ) -> None:
-    out = [] if command[0] == "show" else ["--out", f"{tmp_path}/out"]
+    out = [] if command[0] in ("show", "check") else ["--out", f"{tmp_path}/out"]
     assert main([*command, *out]) == 1
     error = capsys.readouterr().err
     assert said in error and "Traceback" not in error

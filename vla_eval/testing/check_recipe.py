@@ -17,6 +17,7 @@ from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.evaluation.worker import make_policy
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceWatch
 from vla_eval.policies.entries import PolicyEntry
+from vla_eval.tasks.catalog import robot_task
 from vla_eval.testing.check_policy import check_policy
 
 N_SLOTS = 2  # as many episodes as the check runs side by side
@@ -30,6 +31,7 @@ def check_recipe(
     say: Callable[[str], None] = lambda _line: None,
 ) -> list[str]:
     """Check the policy, given what `task` shows; return and `report` what is met, `say` the rest."""
+    robot_task(task, does="`check` gives a policy the observations of")
     config = EvalConfig(
         name="check",
         tasks=(task,),
