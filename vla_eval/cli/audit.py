@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_flags, env_paths
+from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_flags, env_paths, suite_tasks
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
@@ -94,13 +94,11 @@ def _run_base(args: argparse.Namespace) -> int:
 
 def _tasks_and_settings(args: argparse.Namespace) -> tuple[tuple[str, ...], dict[str, Any]]:
     """Return the tasks, and the fields that are set, with their types."""
-    from vla_eval.tasks.catalog import SUITES
-
     settings: dict[str, Any] = {}  # Any: plain data, checked by `decode` below
     apply_overrides(settings, args.overrides, cls=EvalConfig, free=env_paths(args.overrides))
     # Read strictly, with names of nothing: for the types of what was set.
     checked = decode(EvalConfig, {"name": "x", "tasks": ["x"], "policies": ["x"], **settings}, where="--set")
-    return args.tasks or tuple(SUITES[args.suite]), {name: getattr(checked, name) for name in settings}
+    return args.tasks or suite_tasks(args.suite), {name: getattr(checked, name) for name in settings}
 
 
 def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:

@@ -14,6 +14,7 @@ from vla_eval.cli.shared.arguments import (
     positive_argument,
     read_config,
     set_flags,
+    suite_tasks,
     typed_command,
 )
 from vla_eval.cli.shared.cluster import backend_of
@@ -21,7 +22,7 @@ from vla_eval.cli.shared.output import add_table_arguments
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.protocol import fill_from_protocol
-from vla_eval.errors import RecipeError, check_names, unknown_name
+from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.storage.shard import shard_folder
 from vla_eval.strict.decoding import set_field
 from vla_eval.workers.needed_files import Needed, shared_folder
@@ -200,12 +201,9 @@ def _which(text: str, *, flag: str) -> str | int:
 
 def _tasks_of(args: argparse.Namespace) -> list[str]:
     """Return all tasks of the suite that is named in place of tasks."""
-    from vla_eval.tasks.catalog import SUITES
-
     if args.tasks is not None:
         raise RecipeError("--task and --suite: name tasks or a suite, not both.")
-    check_names("suite", [args.suite], SUITES, where="--suite")
-    return list(SUITES[args.suite])
+    return list(suite_tasks(args.suite))
 
 
 def _config(args: argparse.Namespace) -> EvalConfig:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.slips import Several, numbers
 from vla_eval.config.files import Folder
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, check_names
 from vla_eval.results.formats import FORMATS
 from vla_eval.storage.shard import Shard
 from vla_eval.strict.bounds import MAX_EPISODES, check_seeds
@@ -132,6 +132,22 @@ def task_argument(text: str) -> str:
     from vla_eval.tasks.catalog import with_version
 
     return with_version(text)
+
+
+def suite_tasks(name: str) -> tuple[str, ...]:
+    """Return the tasks of a suite; say on standard error which are left out: an episode takes minutes."""
+    from vla_eval.tasks.catalog import SUITES
+
+    check_names("suite", [name], SUITES, where="--suite")
+    specs = next(rows for suite, rows in SUITES.items() if suite == name).values()
+    slow = [spec.id for spec in specs if spec.is_slow]
+    if slow:
+        print(
+            f"left out of --suite {name}, an episode takes minutes: {', '.join(slow)}. Run them apart, "
+            "with --task and fewer --episodes.",
+            file=sys.stderr,
+        )
+    return tuple(spec.id for spec in specs if not spec.is_slow)
 
 
 MANY: Mapping[str, Any] = {"nargs": "+", "action": Several}

@@ -21,6 +21,7 @@ def _spec(row: BaseTask) -> TaskSpec:
         oracle_sees="what is hidden",
         candidates=None,
         chance_success=None,
+        is_slow=row.is_slow,
         lacks=() if row.memoryless else ("memoryless",),
         suite="mikasa_base",
     )
