@@ -35,7 +35,7 @@ FINETUNE_FLAGS = (
     *("held_out_episodes", "overrides"),
 )
 EVAL_FLAGS = (
-    *("protocol", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
+    *("protocol", "suite", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
     *("seed_start", "runs", "overrides", "capture_video", "capture_rrd", "serve"),
 )
 """Flags that a table does not take, by the names of their values; `--task` and `--policy` choose a part."""

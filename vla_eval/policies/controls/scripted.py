@@ -91,14 +91,12 @@ class BallPolicy(ScriptedPolicy):
 
 def make_random(context: PolicyContext) -> RandomPolicy | PlayerPolicy:
     """Make the `random` control."""
-    is_base = task_spec(context.env.task).is_base
-    return PlayerPolicy(context, "random") if is_base else RandomPolicy(context)
+    return RandomPolicy(context) if context.env.is_instructed else PlayerPolicy(context, "random")
 
 
 def make_oracle(context: PolicyContext) -> ScriptedPolicy | TranslatedPolicy | PlayerPolicy:
     """Make the `oracle` for the task of the context."""
-    is_base = task_spec(context.env.task).is_base
-    return PlayerPolicy(context, "oracle") if is_base else _make_arm_oracle(context)
+    return _make_arm_oracle(context) if context.env.is_instructed else PlayerPolicy(context, "oracle")
 
 
 def _maker(mode: Mode, does: str = "") -> Callable[[PolicyContext], ScriptedPolicy | TranslatedPolicy]:
