@@ -26,7 +26,7 @@ suite90: setup  ## install the official package of 90 tasks beside this one, wit
 	$(BIN)/mikasa-vla list tasks --suite mikasa_vla_90
 
 base: setup  ## install what the tasks of MIKASA-Base need, the two in 3D included
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --requirement scripts/base.txt
+	@bash scripts/base.sh
 
 test: base  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)

@@ -16,6 +16,7 @@ def image_rows() -> Iterator[BaseTask]:
     yield _mortar_mayhem()
     yield _mystery_path()
     yield from _two_colors()
+    yield from _memory_maze()
 
 
 def _minigrid() -> Iterator[BaseTask]:
@@ -172,4 +173,39 @@ def _two_colors() -> Iterator[BaseTask]:
             memoryless=f"{PLAYERS}.two_colors:RedInView",
             oracle=f"{PLAYERS}.two_colors:Oracle",
             source="griver/memup at d276571 (no licence: rules only, own map), Freedoom by vizdoom (MIT)",
+        )
+
+
+def _memory_maze() -> Iterator[BaseTask]:
+    small = {"max_rooms": 6, "room_min_size": 3, "room_max_size": 5}
+    large = {"max_rooms": 9, "room_min_size": 3, "room_max_size": 3}
+    rows = (
+        (9, 3, small, 1000, 0.25, 31.5, 26.4),
+        (11, 4, small, 2000, 0.3, 52.4, 44.3),
+        (13, 5, small, 3000, 0.15, 67.2, 55.5),
+        (15, 6, large, 4000, 0.3, 75.2, 67.7),
+    )
+    for side, n_targets, rooms, horizon_steps, random, best, people in rows:
+        yield BaseTask(
+            name=f"MemoryMaze-{side}x{side}-v0",
+            family="MemoryMaze",
+            entry_point="vla_eval.base_tasks.memory_maze:MemoryMazeEnv",
+            kwargs={"side": side, "n_targets": n_targets, "rooms": rooms},
+            horizon_steps=horizon_steps,
+            memory=("spatial",),
+            tier="complex image",
+            extra="base-3d",
+            description="Walk through a maze to the target of the colour that is asked for, again and again.",
+            remember=f"the maze and the places of {n_targets} targets, for {horizon_steps} steps",
+            success=None,
+            figures=Figures(
+                random=random,
+                memoryless=None,
+                best=best,
+                source=f"measured in 20 episodes; best: the map is known; people: {people}, as published",
+            ),
+            memoryless=None,
+            oracle=f"{PLAYERS}.memory_maze:Oracle",
+            source="jurgisp/memory-maze at 4030901 (MIT), after Pasukonis et al. 2022",
+            is_slow=True,
         )
