@@ -45,3 +45,10 @@ def test_tasks_are_listed_by_type_of_memory(capsys: pytest.CaptureFixture[str]) 
     assert "RepeatFirst" not in printed
     assert main(["list", "tasks", "--memory", "sequential"]) == 0
     assert "ChainOfColors3-v0" in capsys.readouterr().out
+
+
+def test_a_whole_suite_leaves_out_what_takes_hours_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", "--suite", "mikasa_base", "--policy", "oracle", "--dry-run"]) == 0
+    printed = capsys.readouterr()
+    assert "left out of --suite mikasa_base" in printed.err and "mikasa_base/MemoryMaze-9x9-v0" in printed.err
+    assert "MemoryMaze" not in printed.out and "mikasa_base/ViZDoomTwoColorsHard-v0" in printed.out

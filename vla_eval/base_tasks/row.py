@@ -61,7 +61,7 @@ class BaseTask:
         memoryless: `module:Class` of the player without memory; None where no good one is known.
         oracle: `module:Class` of the player with perfect memory or the true state.
         hides_action: what an observation means depends on the last action, which it does not show.
-        is_slow: an episode takes minutes: `eval` and `audit` of the whole suite leave it out, and say so.
+        is_slow: 100 episodes take an hour: `eval` and `audit` of the whole suite leave it out, and say so.
         source: upstream, pinned to a commit, and its licence.
     """
 

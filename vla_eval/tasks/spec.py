@@ -75,7 +75,7 @@ class TaskSpec:
     other_arms: tuple[str, ...] = ()  # values of `robot_uids` that it takes in addition to the Panda's
     # arguments required to make a task of this row; empty except for a family
     open_arguments: tuple[str, ...] = ()
-    is_slow: bool = False  # an episode takes minutes: a run of its whole suite leaves it out, and says so
+    is_slow: bool = False  # 100 episodes take an hour: a run of its whole suite leaves it out, and says so
     lacks: tuple[str, ...] = ()  # adapters of controls that others of its suite have, and this task has not
     suite: Suite = "paper"  # the set of tasks that it belongs to
     # its sentence where no prompt set has one under `instruction_key`; a word in braces is filled in by

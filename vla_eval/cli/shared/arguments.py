@@ -135,7 +135,7 @@ def task_argument(text: str) -> str:
 
 
 def suite_tasks(name: str) -> tuple[str, ...]:
-    """Return the tasks of a suite; say on standard error which are left out: an episode takes minutes."""
+    """Return the tasks of a suite; say on standard error which are left out, as they take hours."""
     from vla_eval.tasks.catalog import SUITES
 
     check_names("suite", [name], SUITES, where="--suite")
@@ -143,7 +143,7 @@ def suite_tasks(name: str) -> tuple[str, ...]:
     slow = [spec.id for spec in specs if spec.is_slow]
     if slow:
         print(
-            f"left out of --suite {name}, an episode takes minutes: {', '.join(slow)}. Run them apart, "
+            f"left out of --suite {name}, as 100 episodes take an hour: {', '.join(slow)}. Run them apart, "
             "with --task and fewer --episodes.",
             file=sys.stderr,
         )
