@@ -8,6 +8,8 @@ import pytest
 from vla_eval.audit.base_audit import MOSTLY_NOT, NEEDS, NOT_KNOWN, NOT_OBSERVED, UNDECIDED, audit_base_task
 from vla_eval.cli.main import main
 
+pytestmark = pytest.mark.usefixtures("light_workers")
+
 NAMES = ("MemoryLengthEasy", "Numpad-Discrete", "BattleshipEasy")
 BIT, NUMPAD, SHIPS = (f"mikasa_base/{name}-v0" for name in NAMES)
 

@@ -36,6 +36,11 @@ def _param(name: str) -> Any:
 
 IDS = [_param(name) for name in sorted(BASE_TASKS)]
 """Every level; in a quick run the first of each family."""
+IDS_FLAT = [
+    pytest.param(name, marks=pytest.mark.slow) if name.startswith(tuple(IN_3D)) else _param(name)
+    for name in sorted(BASE_TASKS)
+]
+"""For claims that take long in 3D; their own tests make them on shorter episodes."""
 ANSWERS = ("counts", "bandits", "maze", "is_red", "level", "target", "position")
 
 
@@ -64,7 +69,7 @@ ADVICE = ("symmetric and normalized space", "minimum value is -infinity", "maxim
 """What the checker says of the torque of a pendulum and of velocities, which have no bounds."""
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", IDS_FLAT)
 def test_gymnasiums_checker_finds_nothing(name: str) -> None:
     env = gym.make(base_task(name).gym_id, render_mode="rgb_array")
     with warnings.catch_warnings(record=True) as found:
@@ -75,7 +80,7 @@ def test_gymnasiums_checker_finds_nothing(name: str) -> None:
     env.close()
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", IDS_FLAT)
 def test_an_episode_is_a_function_of_its_seed_and_its_actions(name: str) -> None:
     one, other = (gym.make(base_task(name).gym_id) for _ in range(2))
     _random_episode(other, seed=5)
@@ -186,7 +191,7 @@ def test_the_level_of_an_episode_can_be_given_again(name: str) -> None:
     assert all(np.array_equal(env.true_state()[key], value) for key, value in level.items())
 
 
-@pytest.mark.parametrize("name", IDS)
+@pytest.mark.parametrize("name", IDS_FLAT)
 def test_the_oracle_is_no_worse_than_random_and_a_memoryless_player_sees_no_state(
     name: str,
 ) -> None:

@@ -35,7 +35,9 @@ def _first_episodes(name: str) -> list[GoldenEpisode]:
     return list(golden_episodes(name))
 
 
-@pytest.mark.parametrize("name", SIZES)
+@pytest.mark.parametrize(
+    "name", [SMALL, *(pytest.param(n, marks=pytest.mark.slow) for n in SIZES[1:3]), SIZES[3]]
+)
 def test_a_seed_gives_the_level_and_the_first_steps_of_the_original(name: str) -> None:
     env = make_base_task(name)
     episodes = _first_episodes(name)

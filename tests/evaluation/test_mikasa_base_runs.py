@@ -14,6 +14,8 @@ from vla_eval.errors import RecipeError, SpecMismatchError, TaskArgumentError, U
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import read_run
 
+pytestmark = pytest.mark.usefixtures("light_workers")
+
 BIT, CARDS, NUMPAD, BET = (
     f"mikasa_base/{name}"
     for name in ("MemoryLengthEasy-v0", "MemoryCardsEasy-v0", "Numpad-Discrete-v0", "HigherLowerEasy-v0")
