@@ -85,6 +85,7 @@ def test_every_value_of_spatialvla_is_compared() -> None:
     assert spatialvla_golden.values().unread() == OF_CONVERSION
 
 
+@pytest.mark.slow  # the comparisons themselves are in every run
 def test_every_value_of_openvla_is_compared(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     golden_folder.stored_values.cache_clear()
     published = tmp_path / "published"

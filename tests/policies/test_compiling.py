@@ -69,7 +69,9 @@ def actions(policy: LeRobotPolicy, *, seed: int = 1) -> np.ndarray[Any, Any]:
     return policy.act(window(0, observation(level=40))).actions
 
 
-@pytest.mark.parametrize("kind", [pytest.param("act", marks=pytest.mark.slow), "diffusion", "pi0"])
+@pytest.mark.parametrize(
+    "kind", [*(pytest.param(kind, marks=pytest.mark.slow) for kind in ("act", "diffusion")), "pi0"]
+)
 class TestNetwork:
     def test_a_compiled_network_computes_what_the_network_computes(
         self, kind: str, env: EnvSpec, traced: list[dict[str, Any]], request: pytest.FixtureRequest
