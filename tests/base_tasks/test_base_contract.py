@@ -14,6 +14,7 @@ import vla_eval.base_tasks.register  # noqa: F401
 from vla_eval.base_tasks.catalog import BASE_TASKS, base_task
 from vla_eval.base_tasks.make import make_base_task
 from vla_eval.base_tasks.players.play import Kind, player_of
+from vla_eval.base_tasks.row import Figures
 from vla_eval.errors import InvalidActionError, TaskArgumentError, UnknownNameError
 
 pytestmark = pytest.mark.skipif(find_spec("popgym") is None, reason="needs `make base`")
@@ -262,3 +263,20 @@ def test_several_run_side_by_side_as_alone(mode: str) -> None:
         assert seen.tolist() == [result[0] for result in results]
         assert rewards.tolist() == [result[1] for result in results]
     together.close()
+
+
+@pytest.mark.parametrize("name", sorted(BASE_TASKS))
+def test_every_row_scores_returns_by_its_constants_or_not_at_all(name: str) -> None:
+    figures = BASE_TASKS[name].figures
+    if figures.memoryless is None or figures.best is None or figures.best <= figures.memoryless:
+        assert figures.normalised(0.5) is None
+        return
+    assert figures.normalised(figures.memoryless) == 0.0
+    assert figures.normalised(figures.best) == pytest.approx(1.0)
+    middle = (figures.memoryless + figures.best) / 2
+    assert figures.normalised(middle) == pytest.approx(0.5)
+
+
+def test_a_score_is_undefined_where_memory_gains_nothing() -> None:
+    for memoryless, best in ((1.0, 1.0), (0.97, 0.96), (None, 1.0), (0.0, None)):
+        assert Figures(random=0.0, memoryless=memoryless, best=best, source="").normalised(1.0) is None

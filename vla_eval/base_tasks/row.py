@@ -34,8 +34,11 @@ class Figures:
     source: str
 
     def normalised(self, mean_return: float) -> float | None:
-        """Return (R - R_memoryless) / (R_best - R_memoryless), unclipped; None where either is not known."""
-        if self.memoryless is None or self.best is None:
+        """Return (R - R_memoryless) / (R_best - R_memoryless), unclipped.
+
+        None where either is not known, and where the best is no better than the memoryless one.
+        """
+        if self.memoryless is None or self.best is None or self.best <= self.memoryless:
             return None
         return (mean_return - self.memoryless) / (self.best - self.memoryless)
 
