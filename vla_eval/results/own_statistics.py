@@ -118,8 +118,8 @@ def _return_notes(rows: Sequence[Row]) -> Iterator[str]:
         yield (
             "mean return: with its 95 % t interval, over the episodes of one run or the means of several. "
             "normalised: (R - R_memoryless) / (R_best - R_memoryless), unclipped, by the constants of the "
-            "task (`mikasa-vla show TASK`); — where the best policy without memory is not known, or as good as "
-            "any."
+            "task (`mikasa-vla show TASK`); — where the best policy without memory is not known, or as good "
+            "as any."
         )
 
 
