@@ -1,6 +1,7 @@
 """`mikasa-vla audit`: which tasks can be won without remembering?"""
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -52,14 +53,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the controls, then print the audit to standard output; everything else goes to standard error."""
     from vla_eval.audit.audit_text import render_audit
+    from vla_eval.audit.base_audit import base_audit_config, read_base_audit, render_base_audit
     from vla_eval.audit.evaluations import read_audit
-    from vla_eval.cli.shared.evaluations import evaluate_each
-    from vla_eval.cli.shared.output import print_in, print_shard
     from vla_eval.tasks.catalog import task_spec
 
-    if all(task_spec(task).is_base for task in _tasks_and_settings(args)[0]):
-        return _run_base(args)
-    configs = _configs(args)
+    tasks, settings = _tasks_and_settings(args)
+    if all(task_spec(task).is_base for task in tasks):  # its controls and its verdict are others
+        config = base_audit_config(tasks, episodes=args.episodes, workers=args.workers, settings=settings)
+        return _evaluate(
+            args, (config,), lambda: render_base_audit(read_base_audit(config, args.out), args.format)
+        )
+    configs = _configs(args, tasks, settings)
+    return _evaluate(args, configs, lambda: render_audit(read_audit(configs, args.out), args.format))
+
+
+def _evaluate(args: argparse.Namespace, configs: tuple[EvalConfig, ...], render: Callable[[], str]) -> int:
+    """Run the evaluations, print what is rendered of them, and return the exit code."""
+    from vla_eval.cli.shared.evaluations import evaluate_each
+    from vla_eval.cli.shared.output import print_in, print_shard
+
     out = shard_folder(args.out, args.shard)
     with backend_of(args) as backend:
         done = evaluate_each(((out / config.name, config) for config in configs), args, backend=backend)
@@ -68,27 +80,7 @@ def run(args: argparse.Namespace) -> int:
     if args.shard is not None:
         print_shard(out, args.out, args.shard)
     else:
-        print_in(args.format, render_audit(read_audit(configs, args.out), args.format))
-    return EXIT_EPISODE_ERRORS if done.n_errors else 0
-
-
-def _run_base(args: argparse.Namespace) -> int:
-    """Audit MIKASA-Base: its controls and its verdict are others."""
-    from vla_eval.audit.base_audit import base_audit_config, read_base_audit, render_base_audit
-    from vla_eval.cli.shared.evaluations import evaluate_each
-    from vla_eval.cli.shared.output import print_in, print_shard
-
-    tasks, settings = _tasks_and_settings(args)
-    config = base_audit_config(tasks, episodes=args.episodes, workers=args.workers, settings=settings)
-    out = shard_folder(args.out, args.shard)
-    with backend_of(args) as backend:
-        done = evaluate_each([(out / config.name, config)], args, backend=backend)
-    if done.stopped is not None:
-        return done.stopped
-    if args.shard is not None:
-        print_shard(out, args.out, args.shard)
-    else:
-        print_in(args.format, render_base_audit(read_base_audit(config, args.out), args.format))
+        print_in(args.format, render())
     return EXIT_EPISODE_ERRORS if done.n_errors else 0
 
 
@@ -101,11 +93,12 @@ def _tasks_and_settings(args: argparse.Namespace) -> tuple[tuple[str, ...], dict
     return args.tasks or suite_tasks(args.suite), {name: getattr(checked, name) for name in settings}
 
 
-def _configs(args: argparse.Namespace) -> tuple[EvalConfig, ...]:
+def _configs(
+    args: argparse.Namespace, tasks: tuple[str, ...], settings: dict[str, Any]
+) -> tuple[EvalConfig, ...]:
     from vla_eval.audit.evaluations import audit_configs, protocols_of
     from vla_eval.results.shipped_audit import AuditProtocol
 
-    tasks, settings = _tasks_and_settings(args)
     wanted: tuple[AuditProtocol, ...] = ("paper", "strict") if args.protocol == "both" else (args.protocol,)
     return audit_configs(
         tasks,
