@@ -38,9 +38,10 @@ class PlayerPolicy:
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Seed each episode's player by its task, seed and run."""
         for episode in episodes:
-            player = self._players.setdefault(episode.slot, self._make_player())
+            if episode.slot not in self._players:
+                self._players[episode.slot] = self._make_player()
             task_key = zlib.crc32(episode.task.encode())
-            player.begin(generator(episode.seed, Stream.POLICY, task_key, episode.run))
+            self._players[episode.slot].begin(generator(episode.seed, Stream.POLICY, task_key, episode.run))
 
     def forget(self, slots: Sequence[int]) -> None:
         """Release the players of these slots."""
