@@ -1,6 +1,5 @@
 """Players of the labyrinths."""
 
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -8,14 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.base_tasks.env import Level
-from vla_eval.base_tasks.players.player import Player
+from vla_eval.base_tasks.players.player import Cell, Player, first_step
 
 LEFT, RIGHT, UP, DOWN, NONE = range(5)
 MOVES = {LEFT: (0, -1), RIGHT: (0, 1), UP: (-1, 0), DOWN: (1, 0)}
 CLOCKWISE = (UP, RIGHT, DOWN, LEFT)
 WALL, START, GOAL = 1, 2, 3
-
-Cell = tuple[int, int]
 
 
 class WallFollower(Player):
@@ -56,7 +53,7 @@ class ShortestPath(Player):
     def act(self, observation: Any, state: Level) -> int:
         """Return the first step of it."""
         grid = state["grid"]
-        return _first_step(grid, _cell(state), lambda cell: bool(grid[cell] == GOAL))
+        return _step(state, lambda cell: bool(grid[cell] == GOAL))
 
 
 class NearestUnseen(Player):
@@ -65,7 +62,7 @@ class NearestUnseen(Player):
     def act(self, observation: Any, state: Level) -> int:
         """Return the first step to it."""
         explored = state["explored"]
-        return _first_step(state["grid"], _cell(state), lambda cell: not explored[cell])
+        return _step(state, lambda cell: not explored[cell])
 
 
 def _cell(state: Level) -> Cell:
@@ -73,17 +70,6 @@ def _cell(state: Level) -> Cell:
     return row, column
 
 
-def _first_step(grid: NDArray[Any], start: Cell, is_wanted: Callable[[Cell], bool]) -> int:
-    """Return the first action on a shortest way to a wanted cell, by breadth-first search."""
-    queue, first = deque([start]), {start: NONE}
-    while queue:
-        cell = queue.popleft()
-        if cell != start and is_wanted(cell):
-            return first[cell]
-        for action, (di, dj) in MOVES.items():
-            further = cell[0] + di, cell[1] + dj
-            inside = 0 <= further[0] < grid.shape[0] and 0 <= further[1] < grid.shape[1]
-            if inside and further not in first and grid[further] != WALL:
-                first[further] = action if cell == start else first[cell]
-                queue.append(further)
-    return LEFT
+def _step(state: Level, is_wanted: Callable[[Cell], bool]) -> int:
+    step = first_step(state["grid"] != WALL, _cell(state), is_wanted, MOVES)
+    return LEFT if step is None else step

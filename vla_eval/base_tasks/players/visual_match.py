@@ -1,6 +1,5 @@
 """Players of Passive Visual Match: both gather apples; one knows the colour."""
 
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
@@ -8,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.base_tasks.env import Level
-from vla_eval.base_tasks.players.player import Player
+from vla_eval.base_tasks.players.player import Cell, Player, first_step
 from vla_eval.base_tasks.visual_match import APPLE, MOVES, PADS, REACH, WALL
 
 SIDE = 2 * REACH + 1
@@ -25,7 +24,7 @@ class Oracle(Player):
         wanted = (str(state["target"]),) if int(state["phase"]) == DOORS else (APPLE,)
         board = np.where(np.isin(state["board"], [p for p in PADS if p not in wanted]), WALL, state["board"])
         row, column = (int(number) for number in state["position"])
-        return first_step(board, (row, column), lambda cell: bool(board[cell] in wanted))
+        return _step(board, (row, column), lambda cell: bool(board[cell] in wanted))
 
 
 class NearestInView(Player):
@@ -39,7 +38,7 @@ class NearestInView(Player):
         is_wanted[REACH, REACH] = False
         if is_wanted.any():
             board = np.where(is_wall, WALL, " ")
-            return first_step(board, (REACH, REACH), lambda cell: bool(is_wanted[cell]))
+            return _step(board, (REACH, REACH), lambda cell: bool(is_wanted[cell]))
         west, east = np.flatnonzero(is_wall[REACH, :REACH]), np.flatnonzero(is_wall[REACH, REACH + 1 :])
         if len(west) and len(east):  # only before the pads are there walls this close on both sides
             return NORTH
@@ -47,19 +46,7 @@ class NearestInView(Player):
         return int(self.rng.choice(free)) if free else NORTH
 
 
-def first_step(
-    board: NDArray[Any], start: tuple[int, int], is_wanted: Callable[[tuple[int, int]], bool]
-) -> int:
+def _step(board: NDArray[Any], start: Cell, is_wanted: Callable[[Cell], bool]) -> int:
     """Return the first action on a shortest way to a wanted cell; north if there is none."""
-    queue, first = deque([start]), {start: -1}
-    while queue:
-        cell = queue.popleft()
-        if cell != start and is_wanted(cell):
-            return first[cell]
-        for action, (di, dj) in enumerate(MOVES):
-            near = cell[0] + di, cell[1] + dj
-            is_inside = 0 <= near[0] < board.shape[0] and 0 <= near[1] < board.shape[1]
-            if is_inside and near not in first and board[near] != WALL:
-                first[near] = action if cell == start else first[cell]
-                queue.append(near)
-    return NORTH
+    step = first_step(board != WALL, start, is_wanted, dict(enumerate(MOVES)))
+    return NORTH if step is None else step
