@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from tests.base_tasks.golden_episodes import GoldenEpisode, golden_episodes
-from vla_eval.base_tasks import two_colors_map as maps
 from vla_eval.base_tasks.catalog import BASE_TASKS
-from vla_eval.base_tasks.doom_wad import Jump, Label, Op, Script, When, behavior, push
+from vla_eval.base_tasks.doom import two_colors_map as maps
+from vla_eval.base_tasks.doom.doom_wad import Jump, Label, Op, Script, When, behavior, push
 from vla_eval.base_tasks.make import make_base_task
 from vla_eval.base_tasks.players.two_colors import Oracle
 from vla_eval.lock.switch import locked
@@ -267,7 +267,7 @@ def test_a_game_starts_and_ends_where_only_named_places_may_be_written() -> None
 
 
 def test_an_image_is_made_smaller_by_interpolation_at_the_middle_of_the_new_pixels() -> None:
-    from vla_eval.base_tasks.two_colors import resized
+    from vla_eval.base_tasks.doom.two_colors import resized
 
     ramp = np.zeros((100, 250, 3), np.uint8)
     ramp[..., 0] = np.arange(250)

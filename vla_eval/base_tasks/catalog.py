@@ -4,10 +4,10 @@ Names are the official package's, CognitiveAISystems/MIKASA-Base at ac81b6f. Mem
 paper, table of memory tasks and section "MIKASA-Base". Figures: `Figures.source` says how they were found.
 """
 
-from vla_eval.base_tasks.image_catalog import image_rows
-from vla_eval.base_tasks.popgym_catalog import popgym_rows
+from vla_eval.base_tasks.catalogs.image_catalog import image_rows
+from vla_eval.base_tasks.catalogs.popgym_catalog import popgym_rows
+from vla_eval.base_tasks.catalogs.vector_catalog import vector_rows
 from vla_eval.base_tasks.row import NAMESPACE, BaseTask
-from vla_eval.base_tasks.vector_catalog import vector_rows
 from vla_eval.errors import unknown_name
 
 BASE_TASKS: dict[str, BaseTask] = {

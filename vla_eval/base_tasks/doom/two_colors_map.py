@@ -8,7 +8,7 @@ so that a seed gives the vests and the pillar that it gives there.
 from dataclasses import dataclass
 from typing import NamedTuple
 
-from vla_eval.base_tasks.doom_wad import (
+from vla_eval.base_tasks.doom.doom_wad import (
     Code,
     Jump,
     Label,

@@ -23,7 +23,7 @@ import numpy as np
 import vizdoom
 from numpy.typing import NDArray
 
-from vla_eval.base_tasks import two_colors_map as maps
+from vla_eval.base_tasks.doom import two_colors_map as maps
 from vla_eval.base_tasks.env import BaseTaskEnv, Level
 from vla_eval.errors import RenderingError, check_names
 

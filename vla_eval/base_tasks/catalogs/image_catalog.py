@@ -160,7 +160,7 @@ def _two_colors() -> Iterator[BaseTask]:
         yield BaseTask(
             name=f"ViZDoomTwoColors{name}-v0",
             family="ViZDoomTwoColors",
-            entry_point="vla_eval.base_tasks.two_colors:TwoColorsEnv",
+            entry_point="vla_eval.base_tasks.doom.two_colors:TwoColorsEnv",
             kwargs={"level": name.lower()},
             horizon_steps=horizon_steps,
             memory=("object",),

@@ -1,0 +1,1 @@
+"""ViZDoom-Two-Colors: the environment, its map, and the file format of Doom maps."""
