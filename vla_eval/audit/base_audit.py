@@ -28,7 +28,7 @@ NOT_OBSERVED = "cannot be solved as observed by a policy that draws its actions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MeanReturn:
+class ControlReturn:
     """A control's mean return, and its 95 % interval."""
 
     n_episodes: int
@@ -43,7 +43,7 @@ class BaseAudit:
 
     task: str
     version: int
-    returns: Mapping[str, MeanReturn]  # by the names of the controls
+    returns: Mapping[str, ControlReturn]  # by the names of the controls
     # how far the memoryless player gets from random to the oracle, and the 95 % interval; None where one of
     # them has no episode
     share: float | None
@@ -103,9 +103,9 @@ def audit_base_task(task: str, returns: Mapping[str, Mapping[int, float]], *, n_
     )
 
 
-def _mean(by_seed: Mapping[int, float]) -> MeanReturn:
+def _mean(by_seed: Mapping[int, float]) -> ControlReturn:
     mean, interval = mean_return([list(by_seed.values())])
-    return MeanReturn(n_episodes=len(by_seed), mean=mean, low=interval.low, high=interval.high)
+    return ControlReturn(n_episodes=len(by_seed), mean=mean, low=interval.low, high=interval.high)
 
 
 def _share(returns: Mapping[str, Mapping[int, float]]) -> tuple[float, Interval] | None:
