@@ -66,6 +66,36 @@ def test_the_audit_runs_its_controls_and_prints_a_row_per_task(
     assert "| MemoryLengthEasy-v0 |" in capsys.readouterr().out
 
 
+def test_only_the_controls_that_were_asked_for_are_run(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["audit", "--task", BIT, "--episodes", "2", "--out", str(tmp_path), "--workers", "1"]
+    assert main([*command, "--control", "oracle", "random", "--format", "json"]) == 0
+    (bit,) = json.loads(capsys.readouterr().out)
+    assert set(bit["returns"]) == {"random", "oracle"}
+    assert bit["share"] is None and bit["verdict"] == [UNDECIDED]
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--control", "orcale"], "did you mean 'oracle'"),
+        (["--control", "cue_blind"], "control"),
+        (["--protocol", "strict"], "no arm to hold"),
+        (["--set", "name=mine"], "--set name: an audit sets this field itself"),
+        (["--set", "policies=[oracle]"], "--set policies: an audit sets this field itself"),
+        (["--set", "workers=2"], "--set workers: an audit sets this field itself"),
+    ],
+)
+def test_what_an_audit_of_mikasa_base_cannot_do_is_refused_in_one_line(
+    flags: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["audit", "--task", BIT, "--out", str(tmp_path / "out"), *flags]) == 1
+    said = capsys.readouterr().err
+    assert message in said.lower() if message.startswith("did") else message in said
+    assert not (tmp_path / "out").exists()
+
+
 def test_where_the_oracle_is_no_better_than_random_there_is_no_share() -> None:
     audit = audit_base_task(BIT, _returns(1.0, 0.5, 1.0))
     assert audit.share is None and audit.verdict == (UNDECIDED,)

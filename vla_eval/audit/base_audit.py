@@ -11,8 +11,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vla_eval.audit.evaluations import refuse_own_fields
 from vla_eval.base_tasks.catalog import base_task
 from vla_eval.config.evaluation import EvalConfig
+from vla_eval.errors import check_names
 from vla_eval.results.estimates import CONFIDENCE, Interval, mean_return
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
@@ -54,16 +56,24 @@ class BaseAudit:
 
 
 def base_audit_config(
-    tasks: Sequence[str], *, episodes: int, workers: int | Literal["auto"], settings: Mapping[str, Any]
+    tasks: Sequence[str],
+    *,
+    episodes: int,
+    workers: int | Literal["auto"],
+    controls: Sequence[str] | None = None,
+    settings: Mapping[str, Any] | None = None,  # Any: other fields of `EvalConfig`
 ) -> EvalConfig:
-    """Return the evaluation that an audit consists of; `settings` are other fields of it."""
+    """Return the evaluation that an audit consists of, of these controls only, if given."""
+    check_names("control", controls or (), CONTROLS, where="--control")
+    fields = dict(settings or {})
+    refuse_own_fields(fields)
     return EvalConfig(
         name="audit_mikasa_base",
         tasks=tuple(tasks),
-        policies=CONTROLS,
+        policies=tuple(name for name in CONTROLS if controls is None or name in controls),
         episodes=episodes,
         workers=workers,
-        **settings,
+        **fields,
     )
 
 

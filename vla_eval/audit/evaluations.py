@@ -76,7 +76,8 @@ def audit_configs(
     known = list(dict.fromkeys(name for names in CONTROLS.values() for name in names))
     check_names("control", controls or (), known, where="--control")
     fields = dict(settings or {})
-    _refuse_own_fields(fields, protocols)
+    # An official task's arguments change no rule: which mug, how many steps.
+    refuse_own_fields(fields, own=() if tuple(protocols) == ("official",) else ("env",))
     given_env = fields.pop("env", {})
     configs = []
     for protocol in protocols:
@@ -113,10 +114,9 @@ def _nothing_left(
     )
 
 
-def _refuse_own_fields(settings: Mapping[str, object], protocols: Sequence[AuditProtocol]) -> None:
-    own = ("name", "tasks", "policies", "episodes", "workers")
-    # An official task's arguments change no rule: which mug, how many steps.
-    for name in own if tuple(protocols) == ("official",) else (*own, "env"):
+def refuse_own_fields(settings: Mapping[str, object], *, own: Sequence[str] = ()) -> None:
+    """Refuse to set what every audit sets itself, and the fields that this one sets besides."""
+    for name in ("name", "tasks", "policies", "episodes", "workers", *own):
         if name in settings:
             raise RecipeError(
                 f"--set {name}: an audit sets this field itself. `mikasa-vla eval` lets you set it."

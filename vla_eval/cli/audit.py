@@ -9,6 +9,7 @@ from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, FLAGS, MANY, add_
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
+from vla_eval.errors import RecipeError
 from vla_eval.storage.shard import shard_folder
 from vla_eval.strict.decoding import decode
 
@@ -17,7 +18,8 @@ which a task can be won: without acting, by touching one candidate after another
 by storing the cue in the gripper. Nothing is rendered.
 
 Protocols: 'paper' is the task as it is; under 'strict' arm and gripper are held until the choice and the
-first choice is final. The official package's tasks (--suite mikasa_vla_90) have one, 'official'. The same
+first choice is final. The official package's tasks (--suite mikasa_vla_90) have one, 'official'; MIKASA-Base
+(--suite mikasa_base) has no arm to hold, and controls of its own: 'random', 'memoryless', 'oracle'. The same
 command resumes a stopped audit."""
 
 
@@ -37,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--protocol",
         choices=("paper", "strict", "both"),
         default="both",
-        help="(both); official tasks have their own",
+        help="(both); official tasks and MIKASA-Base have their own",
     )
     add_flags(
         parser,
@@ -59,7 +61,17 @@ def run(args: argparse.Namespace) -> int:
 
     tasks, settings = _tasks_and_settings(args)
     if all(task_spec(task).is_base for task in tasks):  # its controls and its verdict are others
-        config = base_audit_config(tasks, episodes=args.episodes, workers=args.workers, settings=settings)
+        if args.protocol == "strict":
+            raise RecipeError(
+                "--protocol strict: MIKASA-Base has no arm to hold until the choice. Leave --protocol out."
+            )
+        config = base_audit_config(
+            tasks,
+            episodes=args.episodes,
+            workers=args.workers,
+            controls=args.controls,
+            settings=settings,
+        )
         return _evaluate(
             args, (config,), lambda: render_base_audit(read_base_audit(config, args.out), args.format)
         )
