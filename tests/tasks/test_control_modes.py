@@ -54,6 +54,13 @@ def test_the_arm_moves_as_with_maniskill_s_own_controllers_to_the_last_bit(
     space, n_steps = CONTROL_MODES[mode], 40
     drawn = np.random.default_rng(0).uniform(space.low, space.high, (n_steps, len(space.dims))) * 1.5
     states = []
+    known, kept, make_own = tuple(drives.DRIVES), [], drives._own_drive
+
+    def own(controller: Any) -> Any:
+        kept.extend([controller] if isinstance(controller, known) else ())
+        return make_own(controller)
+
+    monkeypatch.setattr(drives, "_own_drive", own)
     for table in (drives.DRIVES, {}):  # without a row, a controller keeps ManiSkill's own way
         monkeypatch.setattr(drives, "DRIVES", table)
         env = env_in(mode, **other_arm)
@@ -65,6 +72,7 @@ def test_the_arm_moves_as_with_maniskill_s_own_controllers_to_the_last_bit(
         states.append([result.observation.state[name] for result in results for name in ("qpos", "qvel")])
         states[-1].append(env.joint_targets(0))
         env.close()
+        assert bool(kept) == (not table), "a mode was compared with itself"
     np.testing.assert_equal(states[0], states[1])
     assert np.ptp(states[0][:-1:2], axis=0).max() > 0.1, "the arm did not move"
 

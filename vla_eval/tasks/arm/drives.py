@@ -54,7 +54,7 @@ def _drive_of(controller: Any) -> Drive:
     """Return ManiSkill's own way where the controller is not one of those below."""
     config = controller.config
     plain = not getattr(config, "use_target", False) and not getattr(config, "interpolate", False)
-    make = DRIVES.get(type(controller)) if plain and getattr(config, "frame", FRAME) == FRAME else None
+    make = DRIVES.get(type(controller)) if plain and getattr(config, "frame", FRAME) in FRAMES else None
     if make is None:
         return _own_drive(controller)
     return make(controller)
@@ -65,6 +65,8 @@ def _own_drive(controller: Any) -> Drive:
 
 
 FRAME = "root_translation:root_aligned_body_rotation"
+FRAMES = (FRAME, "root_translation")
+"""Moved along the axes of the root; a mode that does not turn the hand has no more to its name."""
 
 
 class _Joints:
