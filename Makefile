@@ -3,7 +3,7 @@
 # If it is set, each of the many test processes compiles torch's sources again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help setup demo suite90 base test test-all rehearse gpu-check lint docs bench clean
+.PHONY: help setup demo suite90 base rl test test-all rehearse gpu-check lint docs bench clean
 
 BIN := .venv/bin
 # Each takes about 2 GB, and 10 s to start. One more than two cores: tests wait for processes that they stop.
@@ -28,10 +28,13 @@ suite90: setup  ## install the official package of 90 tasks beside this one, wit
 base: setup  ## install what the tasks of MIKASA-Base need, the two in 3D included
 	@bash scripts/base.sh
 
-test: base  ## run the tests that need neither GPU, network nor much time
+rl: setup  ## install what training by rewards (train-agent) needs
+	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --requirement scripts/rl.txt
+
+test: base rl  ## run the tests that need neither GPU, network nor much time
 	$(PYTEST)
 
-test-all: base  ## run every test this machine can run
+test-all: base rl  ## run every test this machine can run
 	$(PYTEST) -m "not network and not parity and not peer and not full_size and not suite90"
 
 rehearse: setup  ## write, load and run every policy at its published size: 20 GB of memory, 30 GB of disk

@@ -29,6 +29,7 @@ class Stream(IntEnum):
     NOISE = 8
     DISTRACTOR = 9
     SHUFFLE = 10
+    AGENT = 11
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,7 +36,7 @@ def spec_of(task: str, env: BaseTaskEnv) -> EnvSpec:
     """Return what an environment offers, as its spaces say."""
     cameras: list[CameraSpec] = []
     states: list[StateSpec] = []
-    for name, space in _leaves(env.observation_space):
+    for name, space in leaves_of(env.observation_space):
         if _is_image(space):
             height_px, width_px, _ = space.shape or ()
             cameras.append(CameraSpec(name=name, height_px=height_px, width_px=width_px, fov_rad=None))
@@ -109,7 +109,7 @@ def as_named(observation: Any) -> tuple[dict[str, ImageArray], dict[str, FloatAr
 def as_native(space: gym.Space[Any], observation: Observation) -> Any:
     """Return an observation as the environment gave it: the inverse of `as_named`."""
     found: dict[str, Any] = {}
-    for name, leaf in _leaves(space):
+    for name, leaf in leaves_of(space):
         if _is_image(leaf):
             found[name] = observation.images[name]
         else:
@@ -118,7 +118,8 @@ def as_native(space: gym.Space[Any], observation: Observation) -> Any:
     return found if isinstance(space, gym.spaces.Dict) else next(iter(found.values()))
 
 
-def _leaves(space: gym.Space[Any]) -> list[tuple[str, gym.Space[Any]]]:
+def leaves_of(space: gym.Space[Any]) -> list[tuple[str, gym.Space[Any]]]:
+    """Return the parts of an observation, each with its name."""
     if isinstance(space, gym.spaces.Dict):
         return list(space.items())
     return [(IMAGE if _is_image(space) else OBSERVATION, space)]

@@ -27,9 +27,21 @@ from vla_eval.strict.json_fields import get_count, get_mapping, get_text
 
 LEROBOT_ADAPTER = "lerobot"
 LEROBOT_CHECKPOINTS = frozenset(
-    {LEROBOT_ADAPTER, *(name for family in FAMILIES.values() for name in family.adapters)}
+    {
+        LEROBOT_ADAPTER,
+        *(
+            name
+            for family in FAMILIES.values()
+            if family.adapter == LEROBOT_ADAPTER
+            for name in family.adapters
+        ),
+    }
 )
+"""Adapters whose argument `checkpoint` names a policy of LeRobot's: it is asked with an instruction."""
+CHECKPOINTS = LEROBOT_CHECKPOINTS | {family.adapter for family in FAMILIES.values()}
 """Adapters whose argument `checkpoint` names what `find_checkpoint` finds."""
+AGENTS = CHECKPOINTS - LEROBOT_CHECKPOINTS
+"""Those of agents: small enough for each worker, and given no instruction."""
 COMPILE = "compile"
 """Their argument that asks for a compiled network."""
 
@@ -48,14 +60,14 @@ OWN_STEPS = frozenset({ENCODER_STEP, DECODER_STEP})
 def checkpoint_folder(adapter: str, args: Mapping[str, Any]) -> Path | None:
     """Return the folder with the weights of a recipe's policy; None: it has none, or is another package's."""
     checkpoint = args.get("checkpoint")
-    if adapter not in LEROBOT_CHECKPOINTS or not isinstance(checkpoint, str):
+    if adapter not in CHECKPOINTS or not isinstance(checkpoint, str):
         return None
     return find_checkpoint(Path(checkpoint))
 
 
 def known_chunk_size(adapter: str, args: Mapping[str, Any], *, recipe: str) -> int | None:
     """Return how many actions a policy predicts at once; None where only the loaded policy knows that."""
-    if adapter in LEROBOT_CHECKPOINTS and args.get("checkpoint") is None:
+    if adapter in CHECKPOINTS and args.get("checkpoint") is None:
         raise no_weights(recipe)
     _check_names(adapter, args, policy=recipe)
     folder = checkpoint_folder(adapter, args)
@@ -96,7 +108,7 @@ def normalization_notes(adapter: str, args: Mapping[str, Any]) -> dict[str, Any]
     `of`: the dataset whose statistics they are, or `the checkpoint`. `before` and `after` the policy: field
     -> statistic -> numbers. Empty for a policy without a checkpoint of LeRobot's.
     """
-    folder = checkpoint_folder(adapter, args)
+    folder = checkpoint_folder(adapter, args) if adapter in LEROBOT_CHECKPOINTS else None
     if folder is None:
         return {}
     facts = read_facts(folder)
@@ -177,7 +189,7 @@ def _numbers(file: Path) -> dict[str, list[float]]:
 
 def _check_names(adapter: str, args: Mapping[str, Any], *, policy: str) -> None:
     for name in ("checkpoint", "base_checkpoint"):
-        if adapter in LEROBOT_CHECKPOINTS and not isinstance(args.get(name), str | None):
+        if adapter in CHECKPOINTS and not isinstance(args.get(name), str | None):
             raise RecipeError(
                 f"policy '{policy}': args.{name} is {args[name]!r:.80}, expected the path of a folder."
             )

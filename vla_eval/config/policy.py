@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
 
+from vla_eval.config.agents import AgentRecipe
 from vla_eval.config.files import Recipe, load_recipe, search_folders, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, merge_fields
 from vla_eval.errors import UnknownNameError
@@ -32,6 +33,8 @@ class PolicyRecipe:
     needs_candidates: bool = False
     # how weights for it are trained; None for policies that have nothing to train
     finetune: FinetuneRecipe | None = None
+    # how an agent is trained by rewards
+    train_agent: AgentRecipe | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)

@@ -64,14 +64,14 @@ class BaseTaskSim:
         for slot, action in actions.items():
             env = self._envs[slot]
             native = native_action(env.action_space, action, task=self.spec.task)
-            observation, reward, terminated, truncated, info = env.step(native)
+            observation, reward, terminated, _, info = env.step(native)
             self._steps[slot] += 1
             results[slot] = self._result(
                 slot,
                 observation,
                 render=slot in render,
                 reward=reward,
-                is_over=terminated or truncated,
+                is_over=terminated,
                 success=bool(info.get("success", False)),
                 action=action,
             )

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from vla_eval.checkpoints.files import find_checkpoint, weights_file
-from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
+from vla_eval.checkpoints.notes import CHECKPOINTS, LEROBOT_CHECKPOINTS
 from vla_eval.config.evaluation import EvalConfig, may_be_wanted
 from vla_eval.evaluation.episode_jobs import EpisodeJob
 from vla_eval.evaluation.evaluate import describe, worker_count
@@ -180,6 +180,10 @@ def _read_by(policy: PolicyEntry) -> Reads:
     checkpoint = args.get("checkpoint")
     if adapter in LEROBOT_CHECKPOINTS and isinstance(checkpoint, str):
         return "every" if _is_shown_every_frame(find_checkpoint(Path(checkpoint))) else "last"
+    if adapter in CHECKPOINTS and isinstance(checkpoint, str):
+        from vla_eval.policies.agents.network import reads_images  # it imports torch
+
+        return "every" if reads_images(find_checkpoint(Path(checkpoint))) else "none"
     return "every"
 
 

@@ -5,7 +5,7 @@ from itertools import product
 from pathlib import Path
 
 from vla_eval.checkpoints.files import SHIPPED_FOLDER, adapter_bases, checkpoint_sha256, find_checkpoint
-from vla_eval.checkpoints.notes import LEROBOT_CHECKPOINTS
+from vla_eval.checkpoints.notes import CHECKPOINTS
 from vla_eval.config.files import search_folders
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.workers.needed_files import Needed
@@ -17,7 +17,7 @@ CHECKPOINT_ARGS = ("checkpoint", "base_checkpoint")
 def needed_files(policies: Sequence[PolicyEntry]) -> tuple[Needed, ...]:
     """Return the checkpoints that the policies of an evaluation load; `CheckpointError`: one is not here."""
     recipes = [recipe.value for policy in policies for recipe in policy.recipes]
-    own = [recipe for recipe in recipes if recipe.adapter in LEROBOT_CHECKPOINTS]
+    own = [recipe for recipe in recipes if recipe.adapter in CHECKPOINTS]
     named = [recipe.args.get(arg) for recipe, arg in product(own, CHECKPOINT_ARGS)]
     return tuple(
         Needed(

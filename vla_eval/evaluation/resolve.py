@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self  # Any: plain data
 
-from vla_eval.checkpoints.notes import COMPILE, LEROBOT_CHECKPOINTS
+from vla_eval.checkpoints.notes import AGENTS, COMPILE, LEROBOT_CHECKPOINTS
 from vla_eval.config.environment import AS_DESIGNED
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import Recipe, content_of, digest_of
@@ -112,8 +112,8 @@ def resolve(
 
 
 def has_weights(recipe: PolicyRecipe) -> bool:
-    """Whether a policy's recipe names a checkpoint: only such policies are shared."""
-    return isinstance(recipe.args.get("checkpoint"), str)
+    """Whether a policy's recipe names a checkpoint, not of an agent: only such policies are shared."""
+    return isinstance(recipe.args.get("checkpoint"), str) and recipe.adapter not in AGENTS
 
 
 def _compiled(policies: Sequence[PolicyEntry]) -> tuple[PolicyEntry, ...]:

@@ -22,6 +22,8 @@ TINY_POLICY: Mapping[str, Any] = {
     "dtype": "float32",
 }
 """Fields of a tiny policy of the π0 family."""
+AGENT = "mikasa_agent"
+"""Type of what was trained by rewards; no policy of LeRobot's."""
 _BY_TOKENS = "it writes its actions token by token, each in a pass of another shape"
 _HAS_MEMORY = "it is small, and its memory has other shapes at each step"
 _STAGES = "vla_eval.models.shared.stages"
@@ -221,6 +223,14 @@ _ROWS = (
     Family(
         type="lingbot_va",
         why_not="it keeps what it has seen and done inside its networks, for one episode at a time",
+    ),
+    Family(
+        type=AGENT,
+        adapter="agent",
+        adapters={"agent": "vla_eval.policies.agents.policy:make_agent"},
+        docs="docs/agents.md",
+        why_not="it was trained by rewards, and runs by the adapter 'agent'",
+        not_compiled="it is small",
     ),
     Family(type="groot", cuts_chunk=True),
     Family(type="molmoact2", cuts_chunk=True),

@@ -89,6 +89,7 @@ class Family:
     # function `(source, options)` that makes an `Original` of a published checkpoint
     converter: str = ""
     convert_options: str = ""  # the class of its options, whose fields are also the verb's flags
+    adapter: str = "lerobot"  # what runs a checkpoint of it that is named by its folder
     # further adapters of its checkpoints: name -> `module:attribute`, see `policies.registry`
     adapters: Mapping[str, str] = field(default_factory=dict)
     tiny: Tiny | None = None  # its form in a table of tiny models; None: there is none

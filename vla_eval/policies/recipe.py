@@ -18,10 +18,10 @@ from vla_eval.checkpoints.files import (
     read_json,
     weights_file,
 )
-from vla_eval.checkpoints.notes import LEROBOT_ADAPTER
 from vla_eval.checkpoints.policy_types import asked_for_steps
 from vla_eval.config.files import Recipe, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
+from vla_eval.models.families import family_of
 from vla_eval.policies.remote.survey import moved, survey_address
 from vla_eval.strict.json_fields import get_count, get_text
 from vla_eval.wire.addresses import named_server
@@ -78,8 +78,8 @@ def load_policy_recipe(name: str) -> Recipe[PolicyRecipe]:
         sha256=checkpoint_sha256(folder),
         value=PolicyRecipe(
             version=1,
-            description=f"A LeRobot checkpoint of type {kind}.",
-            adapter=LEROBOT_ADAPTER,
+            description=f"A checkpoint of type {kind}.",
+            adapter=family_of(kind or "").adapter,
             args={"checkpoint": str(folder)},
             default_n_action_steps=n_action_steps or 1,
             max_workers=1 if is_big else None,

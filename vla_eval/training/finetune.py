@@ -15,11 +15,8 @@ from typing import Any
 from vla_eval.checkpoints.files import checkpoint_sha256
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.data.exact_statistics import about_still_dimensions
-from vla_eval.errors import VlaEvalError
 from vla_eval.models.shared.sentence_reading import SentenceReading, SentenceWatch
-from vla_eval.storage.durable import on_disk
 from vla_eval.storage.provenance import collect_environment
-from vla_eval.storage.starting import starting
 from vla_eval.training.cost.estimate import RateWatch, estimate
 from vla_eval.training.dataset import about_decisions, about_failures
 from vla_eval.training.extension import check_steps
@@ -29,21 +26,19 @@ from vla_eval.training.loop import Listeners, train
 from vla_eval.training.policy_config import masks_padding
 from vla_eval.training.request import FinetuneSummary, compared_fields, request_sha256
 from vla_eval.training.run_folder import (
-    LOG_FILE,
+    LOCK_FILE,
     REQUEST_KEY,
-    RUN_FILE,
     append_metrics,
     newest_step,
     open_folder,
+    opened,
     read_metrics,
     read_record,
     whole_checkpoints,
 )
 from vla_eval.training.trackers import Services, services
 
-LOCK_FILE = "finetune.lock"
 RUN_ID = "run_id"  # of `finetune.json`
-OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOG_FILE, LOCK_FILE)  # of a run without a step
 Say = Callable[[str], None]
 """Takes a line for a person."""
 IsStopping = Callable[[], bool]
@@ -229,18 +224,8 @@ def _opened(job: TrainingJob, config: FinetuneConfig, command: str) -> Iterator[
     if not _is_first_process():  # the first one has the lock, and checks
         yield next(reversed(whole_checkpoints(job.out)), None)
         return
-    purpose = "the folder of a fine-tuning"
-    with starting(job.out, own=OWN_FILES, lock_file=LOCK_FILE, purpose=purpose) as started:
-        resume_from = _open(job, config, command)
-    failed = False
-    with on_disk(job.out):  # outermost: a run that was stopped by a full disk stays
-        try:
-            yield resume_from
-        except VlaEvalError:
-            failed = True
-            raise
-        finally:
-            started.leave(failed=failed)
+    with opened(job.out, lambda: _open(job, config, command)) as resume_from:
+        yield resume_from
 
 
 # glibc's malloc.h

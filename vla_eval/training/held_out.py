@@ -5,7 +5,7 @@ training that was killed during one finishes it first and then resumes.
 """
 
 import functools
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +21,8 @@ from vla_eval.control_modes import CONTROL_MODE, control_mode_of
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import EvaluationObserver, evaluate
 from vla_eval.evaluation.resolve import resolve
-from vla_eval.results.estimates import wilson_interval
+from vla_eval.records import EpisodeRecord
+from vla_eval.results.estimates import mean_return, wilson_interval
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
@@ -85,23 +86,17 @@ class HeldOut:
         if evaluate(resolved, allow_environment_change=True, observer=stops).was_stopped:
             return
         records = read_run(folder).records
-        results = [bool(record.success_once) for record in records if record.error is None]
-        n_success, n_episodes, n_errors = sum(results), len(results), len(records) - len(results)
-        step, interval = int(checkpoint.name), wilson_interval(n_success, n_episodes)
+        ended = [record for record in records if record.error is None]
+        n_errors = len(records) - len(ended)
+        step = int(checkpoint.name)
         line: dict[str, float | str] = {
             "step": step,
             METRIC_KEY: self.identity,
-            "n_episodes": n_episodes,
+            "n_episodes": len(ended),
             "n_errors": n_errors,
+            **_figures(ended),
         }
-        rate = "no episode came to its end"
-        if interval is not None:
-            line.update(
-                success_once=n_success / n_episodes, success_low=interval.low, success_high=interval.high
-            )
-            rate = (
-                f"success {n_success}/{n_episodes} (95 % interval {interval.low:.2f} to {interval.high:.2f})"
-            )
+        rate = _in_words(line) or "no episode came to its end"
         errors = f", {n_errors} errors: {folder}" if n_errors else ""
         self.say(f"step {step}/{self.last_step}  {self.task}, held-out seeds: {rate}{errors}")
         self.on_metrics(line)
@@ -129,6 +124,36 @@ class HeldOut:
             inference="in_process",  # results of one training have to be comparable on any machine
             workers=settings.workers,
         )
+
+
+def _figures(ended: Sequence[EpisodeRecord]) -> dict[str, float]:
+    """Return the success rate, where the task has a rule for it, and the mean return, with intervals."""
+    found: dict[str, float] = {}
+    known = [record.success_once for record in ended if record.success_once is not None]
+    interval = wilson_interval(sum(known), len(known))
+    if interval is not None:
+        found |= {
+            "success_once": sum(known) / len(known),
+            "success_low": interval.low,
+            "success_high": interval.high,
+        }
+    returns = [record.episode_return for record in ended if record.episode_return is not None]
+    if len(returns) > 1:
+        mean, between = mean_return([returns])
+        found |= {"mean_return": mean, "return_low": between.low, "return_high": between.high}
+    return found
+
+
+def _in_words(line: Mapping[str, float | str]) -> str:
+    n = int(line["n_episodes"])
+    if "success_once" in line:
+        n_success = round(float(line["success_once"]) * n)
+        low, high = (float(line[f"success_{end}"]) for end in ("low", "high"))
+        return f"success {n_success}/{n} (95 % interval {low:.2f} to {high:.2f})"
+    if "mean_return" in line:
+        low, high = (float(line[f"return_{end}"]) for end in ("low", "high"))
+        return f"return {float(line['mean_return']):.3g} (95 % interval {low:.3g} to {high:.3g})"
+    return ""
 
 
 class _UntilStopped(EvaluationObserver):

@@ -8,6 +8,7 @@
 Knows no networks.
 """
 
+import contextlib
 import errno
 import json
 import logging
@@ -19,14 +20,17 @@ from typing import Any
 
 from vla_eval.checkpoints.files import LAST, step_folders
 from vla_eval.config.finetuning import LOGGERS
-from vla_eval.errors import TrainingError
-from vla_eval.storage.durable import read_lines, replace_file, whole_lines
+from vla_eval.errors import TrainingError, VlaEvalError
+from vla_eval.storage.durable import on_disk, read_lines, replace_file, whole_lines
 from vla_eval.storage.folders import other_files
 from vla_eval.storage.run_file import JsonValue, find_changes, listed
+from vla_eval.storage.starting import starting
 from vla_eval.strict.json_text import Source, read_file, read_json, read_version, shown
 
 FORMAT_VERSION = 1
 RUN_FILE, METRICS_FILE, LOG_FILE, TRAIN_FOLDER = "finetune.json", "metrics.jsonl", "train.log", "train"
+LOCK_FILE = "finetune.lock"
+OWN_FILES = (RUN_FILE, f"{RUN_FILE}.tmp", LOG_FILE, LOCK_FILE)  # of a run without a step
 CHECKPOINTS_FOLDER = "checkpoints"
 STATE_FOLDER = "training_state"
 PARTIAL_PREFIX = ".partial-"
@@ -40,6 +44,25 @@ STEPS_CHANGED = "steps_changed"
 
 
 logger = logging.getLogger(__name__)
+
+
+@contextlib.contextmanager
+def opened(path: Path, open_it: Callable[[], Path | None]) -> Iterator[Path | None]:
+    """Lock the folder of a run, open it, and give the checkpoint to resume from, None at the beginning.
+
+    What a start has made is removed if it fails, or if the block ends with a mistake and without a step.
+    """
+    with starting(path, own=OWN_FILES, lock_file=LOCK_FILE, purpose="the folder of a fine-tuning") as started:
+        resume_from = open_it()
+    failed = False
+    with on_disk(path):  # outermost: a run that was stopped by a full disk stays
+        try:
+            yield resume_from
+        except VlaEvalError:
+            failed = True
+            raise
+        finally:
+            started.leave(failed=failed)
 
 
 def open_folder(

@@ -1,0 +1,241 @@
+"""A trained agent is evaluated, held out and compared like any policy; mistakes are one message."""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+pytest.importorskip("stable_baselines3", reason="needs `make rl`")
+
+from tests.agents.tiny_agents import BIT, ROBOT, TINY, tiny, trained
+from vla_eval.agents.train import train_agent
+from vla_eval.cli.main import main
+from vla_eval.config.finetuning import HeldOutConfig
+from vla_eval.errors import MissingDependencyError, VlaEvalError
+from vla_eval.storage.run_folder import read_run
+
+pytestmark = pytest.mark.usefixtures("light_workers")
+
+
+@pytest.fixture(scope="module")
+def agents(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("agents")
+    for algorithm in TINY:
+        trained(tiny(algorithm, folder / algorithm))
+    trained(tiny("ppo_lstm", folder / "bit", BIT))
+    return folder
+
+
+def evaluated(agent: Path, out: Path, *flags: str, task: str = ROBOT) -> dict[int, tuple[Any, ...]]:
+    """Evaluate an agent, and return seed -> what its record says of the episode."""
+    fake = () if task.startswith("mikasa_base") else ("--set", "simulator=fake")
+    command = ["eval", "--task", task, "--policy", str(agent), "--episodes", "4", "--workers", "1", *fake]
+    assert main([*command, *flags, "--out", str(out)]) == 0
+    records = read_run(out).records
+    assert all(record.error is None for record in records)
+    return {record.seed: (record.trajectory_sha256, record.episode_return) for record in records}
+
+
+@pytest.mark.parametrize("algorithm", [*TINY])
+def test_an_agent_is_evaluated_from_its_folder_and_episodes_do_not_share_a_memory(
+    algorithm: str, agents: Path, tmp_path: Path
+) -> None:
+    one = evaluated(agents / algorithm, tmp_path / "one")
+    four = evaluated(agents / algorithm, tmp_path / "four", "--set", "slots_per_worker=4")
+    assert len(one) == 4 and one == four
+
+
+def test_an_agent_of_mikasa_base_is_evaluated_beside_its_controls(
+    agents: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evaluated(agents / "bit", tmp_path / "run", task=BIT)
+    said = capsys.readouterr()
+    assert "bit-000000048" in said.out
+    assert "sentence" not in said.err and "note" not in said.err
+
+
+def test_an_agent_of_another_control_mode_or_task_is_refused_with_what_it_was_trained_in(
+    agents: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = agents / "ppo" / "train/checkpoints/000000048/pretrained_model/config.json"
+    about = json.loads(config.read_text())
+    changed = tmp_path / "changed"
+    changed.mkdir()
+    weights = config.with_name("model.safetensors").read_bytes()
+    (changed / "model.safetensors").write_bytes(weights)
+    changes = {"control_mode": "pd_joint_delta_pos", "env": {"control_mode": "pd_joint_delta_pos"}}
+    (changed / "config.json").write_text(json.dumps({**about, **changes}))
+    command = ["eval", "--episodes", "1", "--workers", "1", "--set", "simulator=fake"]
+    main([*command, "--task", ROBOT, "--policy", str(changed), "--out", str(tmp_path / "a")])
+    assert "--set env.control_mode=pd_joint_delta_pos" in _all(capsys)
+    main(
+        [
+            *command,
+            "--task",
+            "RememberColor9-v0",
+            "--policy",
+            str(agents / "ppo"),
+            "--out",
+            str(tmp_path / "b"),
+        ]
+    )
+    assert "inputs: expected" in _all(capsys)
+
+
+def _all(capsys: pytest.CaptureFixture[str]) -> str:
+    said = capsys.readouterr()
+    return " ".join((said.out + said.err).split())
+
+
+@pytest.mark.parametrize("task", [ROBOT, BIT])
+def test_checkpoints_are_evaluated_on_held_out_seeds_and_change_nothing(task: str, tmp_path: Path) -> None:
+    held_out = HeldOutConfig(every_steps=32, episodes=3, workers=1)
+    with_them = trained(tiny("ppo", tmp_path / "with", task, held_out=held_out))
+    without = trained(tiny("ppo", tmp_path / "without", task))
+    weights = "train/checkpoints/000000048/pretrained_model/model.safetensors"
+    assert (with_them / weights).read_bytes() == (without / weights).read_bytes()
+    lines = [json.loads(line) for line in (with_them / "metrics.jsonl").open()]
+    figures = [line for line in lines if "held_out" in line]
+    assert [line["step"] for line in figures] == [32, 48]
+    assert all(
+        line["n_episodes"] == 3 and "mean_return" in line and "success_once" in line for line in figures
+    )
+    assert {record.seed for record in read_run(next((with_them / "evaluations").iterdir())).records} == {
+        900_000,
+        900_001,
+        900_002,
+    }
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"train_agent": {"arguments": {"batch_size": True}}}, "expected a whole number or a number"),
+        ({"train_agent": {"reward": "sparse"}, "task": BIT}, "has one reward"),
+        ({"train_agent": {"arguments": {"gama": 0.9}}}, "Did you mean 'gamma'"),
+        ({"train_agent": {"arguments": {"n_steps": 0}}}, "expected a whole number of steps"),
+        ({"train_agent": {"arguments": {"policy_kwargs": "x"}}}, "policy_kwargs"),
+        ({"train_agent": {"arguments": {"gamma": "high"}}}, "expected a whole number or a number"),
+        ({"train_agent": {"arguments": {"gamma": [0.9]}}}, "expected a whole number or a number"),
+        ({"train_agent": {"arguments": {"normalize_advantage": 1}}}, "expected true or false"),
+        ({"train_agent": {"network": {"net_arhc": [8]}}}, "Did you mean 'net_arch'"),
+        ({"train_agent": {"network": {"net_arch": "wide"}}}, "train_agent"),
+        ({"train_agent": {"network": {"activation": "tahn"}}}, "Did you mean 'tanh'"),
+        ({"train_agent": {"network": {"lstm_hidden_size": 8}}}, "lstm_hidden_size"),
+        ({"policy": "act"}, "no section `train_agent`"),
+        ({"policy": "ppoo"}, "Did you mean 'ppo"),
+        ({"held_out": HeldOutConfig(every_steps=16, seed_start=50)}, "expected seeds above 100"),
+        ({"held_out": HeldOutConfig(every_steps=16, seed_start=999_999)}, "below 1,000,000"),
+        ({"held_out": HeldOutConfig(every_steps=16, task="RememberColor5-v0")}, "held_out.task"),
+    ],
+)
+def test_a_mistake_is_refused_before_there_is_a_folder(
+    changes: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    task = changes.pop("task", ROBOT)
+    with pytest.raises(VlaEvalError, match=message):
+        train_agent(tiny("ppo", tmp_path / "run", task, **changes))
+    assert not (tmp_path / "run").exists()
+
+
+def test_an_algorithm_of_numbers_is_refused_where_actions_are_choices(tmp_path: Path) -> None:
+    with pytest.raises(VlaEvalError, match="needs actions that are numbers"):
+        train_agent(tiny("sac", tmp_path / "run", BIT, policy="sac"))
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "message"), [("ppo_lsmt", "Did you mean 'ppo_lstm'"), ("tdmpc2", "no package has it")]
+)
+def test_an_unknown_algorithm_and_one_that_is_left_out_say_so(
+    algorithm: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["train-agent", "--algorithm", algorithm, "--task", ROBOT]) == 1
+    assert message in _all(capsys)
+
+
+def test_without_the_library_it_says_how_to_install_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    with pytest.raises(MissingDependencyError, match="make rl"):
+        train_agent(tiny("ppo", tmp_path / "run"))
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("shapes", {}),
+        ("shapes", {"vector": [0]}),
+        ("algorithm", "dqn"),
+        ("network", {"net_arch": [9]}),
+        ("extra", 1),
+        ("observation", "everything"),
+    ],
+)
+def test_a_changed_description_of_a_network_is_refused(
+    field: str, value: object, agents: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = agents / "ppo" / "train/checkpoints/000000048/pretrained_model"
+    folder = tmp_path / "agent"
+    folder.mkdir()
+    (folder / "model.safetensors").write_bytes((source / "model.safetensors").read_bytes())
+    about = {**json.loads((source / "config.json").read_text()), field: value}
+    (folder / "config.json").write_text(json.dumps(about))
+    command = ["eval", "--task", ROBOT, "--policy", str(folder), "--episodes", "1", "--workers", "1"]
+    code = main([*command, "--set", "simulator=fake", "--out", str(tmp_path / "out")])
+    said = _all(capsys)
+    assert code != 0 and "Traceback" not in said and ("expected" in said or "there is no" in said)
+
+
+def test_a_dry_run_says_what_it_takes_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vla_eval.agents.dry_run.MEASURED_SECONDS", 0.1)
+    command = ["train-agent", "--algorithm", "ppo_lstm", "--task", BIT, "--out", str(tmp_path / "run")]
+    assert main([*command, "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "weights" in said and "steps/s here" in said
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_command_trains_and_prints_the_checkpoint(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["train-agent", "--algorithm", "ppo", "--task", BIT, "--steps", "64", "--n-envs", "2"]
+    sizes = [
+        "--set",
+        "arguments.n_steps=16",
+        "--set",
+        "arguments.batch_size=16",
+        "--set",
+        "network.net_arch=[8]",
+    ]
+    assert main([*command, *sizes, "--out", str(tmp_path / "run")]) == 0
+    said = capsys.readouterr()
+    assert said.out.strip().endswith("pretrained_model")
+    assert "step 64/64" in said.err and f"eval --task {BIT}" in said.err
+
+
+def test_a_sequence_at_once_is_what_the_library_does_step_by_step() -> None:
+    from sb3_contrib.common.recurrent.policies import RecurrentMultiInputActorCriticPolicy as Stepwise
+
+    from vla_eval.policies.agents.lstm import WholeSequences
+
+    rng = torch.Generator().manual_seed(0)
+    lstm = torch.nn.LSTM(5, 7, num_layers=2)
+    for n_sequences, n_steps in ((1, 1), (3, 1), (1, 6), (4, 9)):
+        features = torch.randn(n_sequences * n_steps, 5, generator=rng)
+        states = tuple(torch.randn(2, n_sequences, 7, generator=rng) for _ in range(2))
+        for start_at in (None, 0, n_steps - 1):
+            starts = torch.zeros(n_sequences, n_steps)
+            if start_at is not None:
+                starts[::2, start_at] = 1
+            given = (features, states, starts.reshape(-1), lstm)
+            ours, ours_states = WholeSequences._process_sequence(*given)
+            theirs, their_states = Stepwise._process_sequence(*given)
+            torch.testing.assert_close(ours, theirs)
+            for one, other in zip(ours_states, their_states, strict=True):
+                torch.testing.assert_close(one, other)

@@ -1,0 +1,181 @@
+"""One training by rewards, resolved once: all that can be refused is refused before the run has a folder."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vla_eval.agents.vector_env import FIRST_SEED
+from vla_eval.base_tasks.named import DISCRETE
+from vla_eval.checkpoints.files import MODEL_FOLDER
+from vla_eval.config.agents import LOGGERS, AgentConfig, AgentRecipe
+from vla_eval.config.dataset import EVALUATION_SEEDS
+from vla_eval.config.environment import EnvSettings
+from vla_eval.config.files import Recipe, digest_of, to_data
+from vla_eval.config.finetuning import HeldOutConfig, merge_fields
+from vla_eval.config.policy import load_policy
+from vla_eval.envs.factory import describe_env
+from vla_eval.errors import RecipeError
+from vla_eval.policies.agents.algorithms import (
+    Algorithm,
+    algorithm,
+    check_arguments,
+    network_fields,
+    steps_per_update,
+)
+from vla_eval.policies.agents.observing import Reader, reader_of
+from vla_eval.policies.lerobot.device import choose_device
+from vla_eval.specs import EnvSpec
+from vla_eval.strict.decoding import decode
+from vla_eval.tasks.catalog import task_spec
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentJob:
+    """One training."""
+
+    name: str
+    recipe_sha256: str
+    recipe: AgentRecipe  # with the configuration's values on top, steps in whole updates
+    asked_steps: int
+    algorithm: Algorithm
+    task: str
+    settings: EnvSettings
+    env: EnvSpec
+    reader: Reader
+    device: str
+    out: Path
+    run_seed: int
+    held_out: HeldOutConfig | None
+    resume_from: Path | None = None
+
+    @property
+    def first_step(self) -> int:
+        """Steps that are done."""
+        return 0 if self.resume_from is None else int(self.resume_from.name)
+
+    @property
+    def weights(self) -> Path | None:
+        """Folder of the network to go on with; None: from scratch."""
+        return None if self.resume_from is None else self.resume_from / MODEL_FOLDER
+
+    @property
+    def steps_per_update(self) -> int:
+        """Steps of all environments together between two changes of the weights."""
+        return self.recipe.n_envs * steps_per_update(self.algorithm, self.recipe.arguments)
+
+
+def load_agent_recipe(config: AgentConfig) -> Recipe[AgentRecipe]:
+    """Return the recipe's section, with the configuration's values on top."""
+    recipe = load_policy(config.policy)
+    if recipe.value.train_agent is None:
+        raise RecipeError(
+            f"policies/{recipe.name}.yaml has no section `train_agent`: it is not trained by rewards. "
+            f"`mikasa-vla list policies` shows the recipes; `finetune` trains on demonstrations."
+        )
+    data = merge_fields(to_data(recipe.value.train_agent), config.train_agent)
+    value = decode(AgentRecipe, data, where=f"policies/{recipe.name}.yaml, train_agent")
+    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
+
+
+def agent_job(config: AgentConfig) -> AgentJob:
+    """Return the training that a configuration asks for, from its beginning.
+
+    Raises:
+        VlaEvalError: algorithm, task, observation and reward do not fit each other.
+    """
+    loaded, task = load_agent_recipe(config), task_spec(config.task)
+    row = algorithm(loaded.value.algorithm)
+    check_arguments(row, loaded.value.arguments)
+    network_fields(row, loaded.value.network)
+    recipe = _in_whole_updates(loaded.value, row)
+    settings = EnvSettings(
+        task=task.id,
+        kwargs={} if task.is_base else recipe.env,
+        simulator=config.simulator,
+        n_slots=recipe.n_envs,
+    )
+    env = describe_env(settings)
+    if not row.fits_discrete and env.action.control_mode == DISCRETE:
+        raise RecipeError(
+            f"algorithm '{row.name}' needs actions that are numbers; those of {task.id} are choices. "
+            "Take ppo or ppo_lstm."
+        )
+    reader = reader_of(env, recipe.observation, n_candidates=task.n_candidates(settings.kwargs))
+    if task.is_base and recipe.reward == "sparse":
+        raise RecipeError(f"--reward sparse: {task.id} has one reward, its own. Leave it out.")
+    held_out = None if config.held_out is None else _checked_held_out(config.held_out, settings, recipe)
+    return AgentJob(
+        name=loaded.name,
+        recipe_sha256=loaded.sha256,
+        recipe=recipe,
+        asked_steps=loaded.value.steps,
+        algorithm=row,
+        task=task.id,
+        settings=replace(settings, cameras=reader.cameras, privileged=reader.privileged),
+        env=env,
+        reader=reader,
+        device=_device(config.device, reader),
+        out=run_folder_of(config),
+        run_seed=config.run_seed,
+        held_out=held_out,
+    )
+
+
+def _device(asked: str, reader: Reader) -> str:
+    """Return where it computes; `auto`: small networks of numbers are faster on a CPU."""
+    return "cpu" if asked == "auto" and not reader.cameras else choose_device(asked)
+
+
+def run_folder_of(config: AgentConfig) -> Path:
+    """Return the run folder of a training."""
+    if config.out is not None:
+        return Path(config.out)
+    name = task_spec(config.task).id.replace("/", "-")
+    return Path("runs") / f"{Path(config.policy).stem}-{name}-{config.run_seed}"
+
+
+def compared_fields(recipe: AgentRecipe) -> dict[str, Any]:  # Any: plain data
+    """Return the recipe's fields that weights may depend on."""
+    return {name: value for name, value in to_data(recipe).items() if name not in LOGGERS}
+
+
+def request_sha256(recipe: AgentRecipe, task: str, *, run_seed: int) -> str:
+    """Return a digest of all that the weights depend on."""
+    return digest_of([compared_fields(recipe), task, run_seed])
+
+
+def _in_whole_updates(recipe: AgentRecipe, row: Algorithm) -> AgentRecipe:
+    """Return it with steps in whole updates: the library does no half ones."""
+    unit = recipe.n_envs * steps_per_update(row, recipe.arguments)
+    save = _rounded_up(recipe.save_every_steps, unit)
+    return replace(recipe, steps=_rounded_up(recipe.steps, unit), save_every_steps=save)
+
+
+def _rounded_up(number: int, unit: int) -> int:
+    return math.ceil(number / unit) * unit
+
+
+def _checked_held_out(settings: HeldOutConfig, env: EnvSettings, recipe: AgentRecipe) -> HeldOutConfig:
+    """Return when and on what checkpoints are evaluated: on the training's own task."""
+    last = settings.seed_start + settings.episodes - 1
+    if settings.seed_start <= EVALUATION_SEEDS[-1] or last >= FIRST_SEED:
+        raise RecipeError(
+            f"held_out.seed_start={settings.seed_start}, episodes={settings.episodes}: expected seeds above "
+            f"{EVALUATION_SEEDS[-1]}, which tables are made from, and below {FIRST_SEED:,}, from where on "
+            "the training's are."
+        )
+    _refuse_other(settings)
+    every = _rounded_up(settings.every_steps, recipe.save_every_steps)
+    return replace(settings, every_steps=every, env=dict(env.kwargs), task=env.task, simulator=env.simulator)
+
+
+def _refuse_other(settings: HeldOutConfig) -> None:
+    given: Mapping[str, object] = {"task": settings.task, "env": settings.env or None}
+    for name, value in given.items():
+        if value is not None:
+            raise RecipeError(
+                f"held_out.{name}: an agent is evaluated in the environment that it is trained in. Leave it "
+                "out; `mikasa-vla eval` evaluates a checkpoint elsewhere."
+            )

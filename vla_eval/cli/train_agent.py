@@ -1,0 +1,155 @@
+"""`mikasa-vla train-agent`: train an agent by rewards, or resume its training."""
+
+import argparse
+import contextlib
+import sys
+from typing import TYPE_CHECKING, Any
+
+from vla_eval.cli.shared.arguments import (
+    add_flags,
+    env_paths,
+    read_config,
+    set_flags,
+    task_argument,
+    typed_command,
+)
+from vla_eval.config.agents import AgentConfig, AgentRecipe
+from vla_eval.config.files import apply_overrides
+from vla_eval.errors import RecipeError
+from vla_eval.storage.folders import check_writable
+from vla_eval.strict.decoding import set_field
+
+if TYPE_CHECKING:
+    from vla_eval.cli.terminal.progress import StopRequest
+    from vla_eval.training.request import FinetuneSummary
+
+DESCRIPTION = """Train an agent by rewards, without demonstrations: PPO, PPO-LSTM, SAC (stable-baselines3).
+
+--algorithm takes the recipe of that name that fits the task; --policy NAME takes another one in policies/
+with a `train_agent` section, for example ppo_published. CONFIG is a file with fields `policy`, `task`,
+`out`, `run_seed`, `train_agent`, `held_out`. --set changes a field of the recipe's section
+(--set arguments.gamma=0.9). The same command again resumes it exactly, also after a kill, from its last
+checkpoint. Then: mikasa-vla eval --policy RUN --task TASK"""
+
+EPILOG = """docs/agents.md explains recipes, observations, resuming. Exit codes: 0 trained to the last step;
+1 a mistake; 130, 143 stopped by Ctrl-C, SIGTERM (the same command resumes from the last checkpoint)."""
+ANSWER_TO_STOP = "Stopping. What came after the last checkpoint will be trained again."
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Declare the arguments."""
+    parser.description, parser.epilog = DESCRIPTION, EPILOG
+    parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument("--algorithm", metavar="A", help="ppo, ppo_lstm, sac")
+    which.add_argument("--policy", metavar="NAME", help="recipe in policies/ with a `train_agent` section")
+    parser.add_argument("--task", type=task_argument, metavar="T", help="task id")
+    parser.add_argument(
+        "--observation",
+        metavar="O",
+        help="state (with the answer), vector (what is in view), rgb_joints; image (MIKASA-Base)",
+    )
+    parser.add_argument("--reward", metavar="R", help="dense, sparse (the recipe's)")
+    parser.add_argument(
+        "--steps", type=int, metavar="N", help="control steps of all environments (the recipe's)"
+    )
+    parser.add_argument("--n-envs", type=int, metavar="E", help="environments side by side (the recipe's)")
+    parser.add_argument(
+        "--run-seed", type=int, metavar="S", help="seed of weights, exploration and episodes (0)"
+    )
+    parser.add_argument("--device", metavar="D", help="auto, cpu, cuda")
+    parser.add_argument(
+        "--held-out-every",
+        type=int,
+        metavar="N",
+        help="evaluate a checkpoint every N steps, on held-out seeds",
+    )
+    parser.add_argument(
+        "--held-out-episodes", type=int, metavar="E", help="episodes of each such evaluation (20)"
+    )
+    parser.add_argument("--out", metavar="DIR", help="run folder (runs/POLICY-TASK-SEED)")
+    add_flags(parser, "--dry-run", set="change any field of the recipe's `train_agent` section")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Train; lines for a person go to standard error, the checkpoint's folder to standard output."""
+    config, command = _config(args), typed_command()
+    if args.dry_run:
+        from vla_eval.agents.dry_run import describe_training
+
+        with contextlib.redirect_stdout(sys.stderr):
+            lines = describe_training(config)
+        print("\n".join(lines))
+        return 0
+    summary, stop = _train(config, command=command)
+    if stop is not None:
+        print(
+            f"Stopped; step {summary.step:,} is saved in {summary.out}. To resume: {command}", file=sys.stderr
+        )
+        return stop.exit_code
+    from vla_eval.cli.shared.output import hint_next
+
+    print(summary.checkpoint, flush=True)
+    hint_next("eval", "--task", config.task, "--policy", summary.out)
+    return 0
+
+
+def _train(config: AgentConfig, *, command: str) -> "tuple[FinetuneSummary, StopRequest | None]":
+    from tqdm import tqdm
+
+    from vla_eval.agents.job import run_folder_of
+    from vla_eval.agents.train import train_agent
+    from vla_eval.cli.terminal.progress import stop_on_signals
+
+    check_writable(run_folder_of(config))
+    with stop_on_signals(ANSWER_TO_STOP) as stop, contextlib.redirect_stdout(sys.stderr):
+        summary = train_agent(
+            config,
+            command=command,
+            say=lambda line: tqdm.write(line, file=sys.stderr),
+            is_stopping=lambda: stop.is_asked,
+        )
+    return summary, None if summary.is_finished else stop
+
+
+def _config(args: argparse.Namespace) -> AgentConfig:
+    def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
+        set_flags(data, args, ("policy", "task", "run_seed", "device", "out"))
+        for path, value in (
+            ("held_out.every_steps", args.held_out_every),
+            ("held_out.episodes", args.held_out_episodes),
+            ("train_agent.observation", args.observation),
+            ("train_agent.reward", args.reward),
+            ("train_agent.steps", args.steps),
+            ("train_agent.n_envs", args.n_envs),
+        ):
+            if value is not None:
+                set_field(AgentConfig, data, path, value, where="command line")
+        if isinstance(
+            data.setdefault("train_agent", {}), dict
+        ):  # anything else is refused when it is decoded
+            free = env_paths(args.overrides)
+            apply_overrides(data["train_agent"], args.overrides, cls=AgentRecipe, free=free)
+        if args.algorithm is not None and "task" in data:
+            data["policy"] = _recipe_of(args.algorithm, data["task"])
+
+    return read_config(
+        AgentConfig,
+        edit,
+        folder="configs",
+        name=args.config,
+        start={},
+        asks="a configuration, or an algorithm and a task",
+        needed={"task": "--task", "policy": "--algorithm"},
+        example="train-agent --algorithm ppo_lstm --task mikasa_base/RepeatFirstEasy-v0",
+    )
+
+
+def _recipe_of(name: str, task: object) -> str:
+    """Return the recipe that is meant by an algorithm on a task."""
+    from vla_eval.policies.agents.algorithms import algorithm
+    from vla_eval.tasks.catalog import task_spec
+
+    if not isinstance(task, str):
+        raise RecipeError(f"task: expected text, found {task!r:.80}.")
+    return algorithm(name).recipes["base" if task_spec(task).is_base else "robot"]

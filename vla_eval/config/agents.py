@@ -1,0 +1,57 @@
+"""The `train_agent` section of `policies/*.yaml`, and one training by rewards. Standard library only."""
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from vla_eval.config.environment import Simulator
+from vla_eval.config.finetuning import HeldOutConfig
+from vla_eval.strict.bounds import Slots, TrainingSteps, check_bounds, check_seeds
+from vla_eval.strict.devices import check_device
+
+Algorithm = Literal["ppo", "ppo_lstm", "sac"]
+Observed = Literal["state", "vector", "rgb_joints", "image"]
+Rewards = Literal["dense", "sparse"]
+
+LOGGERS = ("tensorboard",)
+"""Fields that may be changed when a training is resumed: no weight depends on them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentRecipe:
+    """How to train an agent by rewards. `docs/agents.md` has the table of all fields."""
+
+    algorithm: Algorithm
+    observation: Observed | None = None  # what the agent is given; None: what its suite has
+    reward: Rewards = "dense"
+    env: dict[str, Any] = field(default_factory=dict)  # Any: the task checks its arguments
+    steps: TrainingSteps = 1_000_000  # of all environments together
+    n_envs: Slots = 16
+    save_every_steps: TrainingSteps = 50_000
+    # of the library's class (`n_steps`, `batch_size`, `gamma` …); Any: checked by its signature
+    arguments: dict[str, Any] = field(default_factory=dict)
+    # of its network (`net_arch`, `activation`, `lstm_hidden_size` …); Any: likewise
+    network: dict[str, Any] = field(default_factory=dict)
+    anneal_lr: bool = False  # the learning rate falls to zero by the last step
+    tensorboard: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(self, prefix="train_agent.")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentConfig:
+    """One training, as `mikasa-vla train-agent CONFIG` reads it."""
+
+    policy: str  # name of a recipe in `policies/` that has a `train_agent` section
+    task: str
+    out: str | None = None  # the run folder; None: `runs/POLICY-TASK-SEED`
+    run_seed: int = 0  # of initial weights, exploration, and the seeds of the training's episodes
+    # fields of the recipe's section, set to other values; Any: decoded as an AgentRecipe
+    train_agent: dict[str, Any] = field(default_factory=dict)
+    device: str = "auto"
+    simulator: Simulator = "maniskill"
+    held_out: HeldOutConfig | None = None  # None: no checkpoint is evaluated during training
+
+    def __post_init__(self) -> None:
+        check_seeds(self.run_seed, name="run_seed")
+        check_device(self.device)

@@ -1,0 +1,94 @@
+"""The adapter `agent`: an agent trained by rewards, one inference per step, its memory per episode."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any  # the library's networks and what they remember
+
+import numpy as np
+
+from vla_eval.checkpoints.bases import no_weights
+from vla_eval.checkpoints.files import find_checkpoint
+from vla_eval.checkpoints.trained_with import refuse_differences
+from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
+from vla_eval.policies.agents.network import AgentNetwork, load_network, read_about
+from vla_eval.policies.agents.observing import action_space, as_action, reader_of
+from vla_eval.policies.context import PolicyContext
+from vla_eval.specs import PolicySpec
+
+
+class AgentPolicy:
+    """The most likely action at each step; nothing is drawn."""
+
+    def __init__(self, context: PolicyContext, network: Any, about: AgentNetwork) -> None:
+        reader = reader_of(context.env, about.observation, n_candidates=context.n_candidates)
+        self._read, self._network, self._about = reader.read, network, about
+        self._action, self._task = context.env.action, context.env.task
+        self._memory: dict[int, Any] = {}
+        self.spec = PolicySpec(
+            name=context.name,
+            reads="every",
+            cameras=reader.cameras,
+            states=reader.states,
+            chunk_size=about.chunk_size,
+            privileged=reader.privileged,
+        )
+
+    def reset(self, episodes: Sequence[EpisodeStart]) -> None:
+        """Begin these episodes: with an empty memory."""
+        for episode in episodes:
+            self._memory[episode.slot] = None
+
+    def forget(self, slots: Sequence[int]) -> None:
+        """Release the memory of these slots."""
+        for slot in slots:
+            self._memory.pop(slot, None)
+
+    def act(self, window: ObservationWindow) -> ActionChunk:
+        """Return the action for the last observation."""
+        memory, is_first = self._memory[window.slot], self._memory[window.slot] is None
+        seen = self._read(window.last)
+        self._check_shapes({name: values.shape for name, values in seen.items()})
+        chosen, remembered = self._network.predict(
+            {name: values[None] for name, values in seen.items()},
+            state=memory,
+            episode_start=np.array([is_first]),
+            deterministic=True,
+        )
+        self._memory[window.slot] = remembered
+        return ActionChunk(actions=as_action(self._action, chosen[0])[None])
+
+    def _check_shapes(self, found: dict[str, tuple[int, ...]]) -> None:
+        expected = self._about.shapes
+        if found != expected:
+            line = f"  inputs: expected {expected} (trained on {self._about.task}), found {found}. "
+            refuse_differences([line.strip()], policy=self.spec.name, task=self._task)
+
+
+def make_agent(context: PolicyContext, *, checkpoint: str | None = None) -> AgentPolicy:
+    """Make the policy of a checkpoint that `mikasa-vla train-agent` wrote.
+
+    Args:
+        context: what it is made for.
+        checkpoint: a run's folder, or a checkpoint's.
+
+    Raises:
+        CheckpointError: there is none, or it is damaged.
+        SpecMismatchError: the task's actions are not those that it was trained with.
+        MissingDependencyError: stable-baselines3 is not installed.
+    """
+    if checkpoint is None:
+        raise no_weights(context.name)
+    folder = find_checkpoint(Path(checkpoint))
+    about = read_about(folder)
+    pairs = (
+        ("control mode", about.control_mode, context.env.action.control_mode),
+        ("action dimensions", about.action_dims, context.env.action.dims),
+    )
+    trained_in = " ".join(f"--set env.{name}={value}" for name, value in about.env.items())
+    lines = [
+        f"{what}: expected {trained}, found {asked}. Evaluate it on {about.task} {trained_in}".rstrip() + "."
+        for what, trained, asked in pairs
+        if trained != asked
+    ]
+    refuse_differences(lines, policy=context.name, task=context.env.task)
+    return AgentPolicy(context, load_network(folder, about, action_space(context.env.action)), about)
