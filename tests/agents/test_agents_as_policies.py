@@ -14,7 +14,8 @@ from tests.agents.tiny_agents import BIT, ROBOT, TINY, tiny, trained
 from vla_eval.agents.train import train_agent
 from vla_eval.cli.main import main
 from vla_eval.config.finetuning import HeldOutConfig
-from vla_eval.errors import MissingDependencyError, VlaEvalError
+from vla_eval.errors import MissingDependencyError, SpecMismatchError, VlaEvalError
+from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.storage.run_folder import read_run
 
 pytestmark = pytest.mark.usefixtures("light_workers")
@@ -239,3 +240,16 @@ def test_a_sequence_at_once_is_what_the_library_does_step_by_step() -> None:
             torch.testing.assert_close(ours, theirs)
             for one, other in zip(ours_states, their_states, strict=True):
                 torch.testing.assert_close(one, other)
+
+
+def test_an_agent_with_cameras_is_trained_evaluated_and_served(tmp_path: Path) -> None:
+    fields = {"observation": "rgb_joints", "steps": 16}
+    agent = trained(tiny("ppo_lstm", tmp_path / "seeing", train_agent=fields))
+    assert len(evaluated(agent, tmp_path / "run")) == 4
+    hosted = host_policy(HostOptions(policy=str(agent)))
+    assert hosted.task == ROBOT and set(hosted.policy.spec.cameras) == {"base_camera", "hand_camera"}
+
+
+def test_an_agent_that_is_given_true_states_is_not_served(agents: Path) -> None:
+    with pytest.raises(SpecMismatchError, match="true state"):
+        host_policy(HostOptions(policy=str(agents / "ppo")))

@@ -1,7 +1,9 @@
 """What a training would take: sizes, memory, and the time by a moment of it. Writes nothing."""
 
+import tempfile
 import time
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 
@@ -20,7 +22,12 @@ def describe_training(config: AgentConfig) -> list[str]:
         VlaEvalError: what a training would refuse.
     """
     job = agent_job(config)
-    with global_generators_kept(), one_thread(job), closing(environments(job)) as envs:
+    with (
+        global_generators_kept(),
+        one_thread(job),
+        tempfile.TemporaryDirectory() as logs,
+        closing(environments(job, logs=Path(logs))) as envs,
+    ):
         model = make_model(job, envs)
         lines = described(job, model)
         begun, n_steps = time.monotonic(), 0

@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from vla_eval.agents.vector_env import FIRST_SEED
 from vla_eval.base_tasks.named import DISCRETE
@@ -48,6 +48,7 @@ class AgentJob:
     out: Path
     run_seed: int
     held_out: HeldOutConfig | None
+    workers: int | Literal["auto"] = "auto"
     resume_from: Path | None = None
 
     @property
@@ -57,7 +58,7 @@ class AgentJob:
 
     @property
     def weights(self) -> Path | None:
-        """Folder of the network to go on with; None: from scratch."""
+        """Folder of the network to continue with; None: from scratch."""
         return None if self.resume_from is None else self.resume_from / MODEL_FOLDER
 
     @property
@@ -120,6 +121,7 @@ def agent_job(config: AgentConfig) -> AgentJob:
         out=run_folder_of(config),
         run_seed=config.run_seed,
         held_out=held_out,
+        workers=config.workers,
     )
 
 

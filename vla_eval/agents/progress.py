@@ -18,7 +18,7 @@ SECONDS_BETWEEN_LINES = 10.0
 
 
 class Progress(BaseCallback):
-    """Asked at each step whether to go on; writes what the library logs."""
+    """Asked at each step whether to continue; writes what the library logs."""
 
     def __init__(
         self, job: AgentJob, envs: SlotsEnv, say: Callable[[str], None], is_stopping: Callable[[], bool]

@@ -1,7 +1,7 @@
 """Train an agent by rewards: a recipe and a task in, a run folder with checkpoints out.
 
 The library does not store environments. So all of them begin new episodes after each checkpoint, and all
-generators are seeded by run seed and step: a training that was killed goes on as if it had not been.
+generators are seeded by run seed and step: a training that was killed continues as if it had not been.
 """
 
 import functools
@@ -21,14 +21,15 @@ from vla_eval.agents.checkpoints import load_checkpoint, write_checkpoint
 from vla_eval.agents.curve import draw_curve
 from vla_eval.agents.job import AgentJob, agent_job, compared_fields, request_sha256
 from vla_eval.agents.progress import Progress, quiet_logger
+from vla_eval.agents.simulators import LOGS_FOLDER, simulators
 from vla_eval.agents.vector_env import SlotsEnv
 from vla_eval.config.agents import AgentConfig
 from vla_eval.config.files import to_data
-from vla_eval.envs.factory import make_env
 from vla_eval.errors import TrainingError
 from vla_eval.policies.agents.algorithms import asked_of_library, library_class, network_class, network_fields
 from vla_eval.seeding import global_generators_kept, seed_global_generators
 from vla_eval.storage.provenance import collect_environment
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.held_out import HeldOut
 from vla_eval.training.request import FinetuneSummary
 from vla_eval.training.run_folder import (
@@ -78,9 +79,8 @@ def train_agent(
 
 
 def _train(job: AgentJob, say: Say, held_out: HeldOut | None, is_stopping: Callable[[], bool]) -> None:
-    with closing(environments(job)) as envs:
+    with closing(environments(job, logs=job.out / LOGS_FOLDER)) as envs:
         model = make_model(job, envs)
-        gc.freeze()  # what was imported for them, too
         for line in described(job, model):
             say(line)
         if job.resume_from is not None:
@@ -128,7 +128,7 @@ def make_model(job: AgentJob, envs: SlotsEnv) -> Any:
         rate = float(
             arguments.get("learning_rate", inspect.signature(cls).parameters["learning_rate"].default)
         )
-        # by the steps that are done: the library's own measure starts anew at each checkpoint
+        # by the steps that are done: the library's own measure starts again at each checkpoint
         arguments["learning_rate"] = lambda _progress: rate * (1 - _done(made, job))
     made: list[Any] = []
     warnings.filterwarnings(
@@ -145,6 +145,7 @@ def make_model(job: AgentJob, envs: SlotsEnv) -> Any:
         where=f"policies/{job.name}.yaml, train_agent",
     )
     made.append(model)
+    gc.freeze()  # what was imported meanwhile, too
     return model
 
 
@@ -154,10 +155,15 @@ def _done(made: list[Any], job: AgentJob) -> float:
     return max(0, steps) / job.recipe.steps
 
 
-def environments(job: AgentJob) -> SlotsEnv:
-    """Return the environments of a training, side by side in this process."""
+def environments(job: AgentJob, *, logs: Path) -> SlotsEnv:
+    """Return the environments of a training, side by side; processes of theirs write to `logs`."""
     return SlotsEnv(
-        make_env(job.settings),
+        simulators(
+            job.settings,
+            workers=job.workers,
+            is_robot=not task_spec(job.task).is_base,
+            logs=logs,
+        ),
         job.reader,
         n_slots=job.recipe.n_envs,
         reward=job.recipe.reward,

@@ -68,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--held-out-episodes", type=int, metavar="E", help="episodes of each such evaluation (20)"
     )
     parser.add_argument("--out", metavar="DIR", help="run folder (runs/POLICY-TASK-SEED)")
-    add_flags(parser, "--dry-run", set="change any field of the recipe's `train_agent` section")
+    add_flags(parser, "--workers", "--dry-run", set="change any field of the recipe's `train_agent` section")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -114,7 +114,7 @@ def _train(config: AgentConfig, *, command: str) -> "tuple[FinetuneSummary, Stop
 
 def _config(args: argparse.Namespace) -> AgentConfig:
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        set_flags(data, args, ("policy", "task", "run_seed", "device", "out"))
+        set_flags(data, args, ("policy", "task", "run_seed", "device", "out", "workers"))
         for path, value in (
             ("held_out.every_steps", args.held_out_every),
             ("held_out.episodes", args.held_out_episodes),

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from vla_eval.config.environment import Simulator
 from vla_eval.config.finetuning import HeldOutConfig
-from vla_eval.strict.bounds import Slots, TrainingSteps, check_bounds, check_seeds
+from vla_eval.strict.bounds import Slots, TrainingSteps, Workers, check_bounds, check_seeds
 from vla_eval.strict.devices import check_device
 
 Algorithm = Literal["ppo", "ppo_lstm", "sac"]
@@ -50,8 +50,10 @@ class AgentConfig:
     train_agent: dict[str, Any] = field(default_factory=dict)
     device: str = "auto"
     simulator: Simulator = "maniskill"
+    workers: Workers = "auto"  # processes that simulate; moves no result
     held_out: HeldOutConfig | None = None  # None: no checkpoint is evaluated during training
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         check_seeds(self.run_seed, name="run_seed")
         check_device(self.device)

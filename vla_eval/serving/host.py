@@ -12,6 +12,7 @@ from typing import Any  # Any: arguments of an adapter
 from vla_eval.checkpoints.execution_fields import ignored_fields
 from vla_eval.checkpoints.files import find_checkpoint, read_facts
 from vla_eval.checkpoints.notes import (
+    AGENTS,
     COMPILE,
     LEROBOT_ADAPTER,
     checkpoint_hashes,
@@ -40,7 +41,7 @@ from vla_eval.specs import EnvSpec, check_compatible
 from vla_eval.storage.provenance import PACKAGES, package_version
 from vla_eval.strict.bounds import MAX_SERVER_ROWS, MAX_STEPS, check_bounds
 from vla_eval.tasks.arguments import offered_by
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import robot_task, task_spec
 from vla_eval.tasks.interface import ANY_TASK, IMAGE_SIZE, env_spec
 from vla_eval.wire.metadata import PROTOCOL, SUPPORTS, ServerMetadata
 
@@ -138,6 +139,11 @@ def _environment(recipe: Recipe[PolicyRecipe], options: HostOptions) -> EnvSpec:
     """Return what the policy is made for: our tasks, with the control mode and images of its training."""
     task = None if options.task is None else task_spec(options.task)
     checkpoint = recipe.value.args.get("checkpoint")
+    if recipe.value.adapter in AGENTS and isinstance(checkpoint, str):
+        from vla_eval.policies.agents.network import read_about  # it imports torch
+
+        about = read_about(find_checkpoint(Path(checkpoint)))
+        return offered_by(robot_task(about.task, does="`serve` is for") if task is None else task, about.env)
     is_ours = recipe.value.adapter == LEROBOT_ADAPTER and isinstance(checkpoint, str)
     facts = read_facts(find_checkpoint(Path(checkpoint))) if is_ours and checkpoint else None
     if facts is None:
