@@ -41,7 +41,7 @@ _ROWS = (
         network="vla_eval.policies.agents.lstm:WholeSequences",
         recipes={"robot": "ppo_lstm", "base": "ppo_lstm_base"},
         steps="n_steps",
-        extras=("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm"),
+        extras=("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm", "lstm_forget_bias"),
         has_memory=True,
     ),
     Algorithm(
