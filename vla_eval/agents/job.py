@@ -1,20 +1,17 @@
 """One training by rewards, resolved once: all that can be refused is refused before the run has a folder."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
-from vla_eval.agents.vector_env import FIRST_SEED
+from vla_eval.agents.request import in_whole_updates, load_agent_recipe, rounded_up, run_folder_of
 from vla_eval.base_tasks.named import DISCRETE
 from vla_eval.checkpoints.files import MODEL_FOLDER
-from vla_eval.config.agents import LOGGERS, AgentConfig, AgentRecipe
+from vla_eval.config.agents import TRAINING_SEEDS, AgentConfig, AgentRecipe
 from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.environment import EnvSettings
-from vla_eval.config.files import Recipe, digest_of, to_data
-from vla_eval.config.finetuning import HeldOutConfig, merge_fields
-from vla_eval.config.policy import load_policy
+from vla_eval.config.finetuning import HeldOutConfig
 from vla_eval.envs.factory import describe_env
 from vla_eval.errors import RecipeError
 from vla_eval.policies.agents.algorithms import (
@@ -27,7 +24,6 @@ from vla_eval.policies.agents.algorithms import (
 from vla_eval.policies.agents.observing import Reader, reader_of
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.specs import EnvSpec
-from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 
 
@@ -67,19 +63,6 @@ class AgentJob:
         return self.recipe.n_envs * steps_per_update(self.algorithm, self.recipe.arguments)
 
 
-def load_agent_recipe(config: AgentConfig) -> Recipe[AgentRecipe]:
-    """Return the recipe's section, with the configuration's values on top."""
-    recipe = load_policy(config.policy)
-    if recipe.value.train_agent is None:
-        raise RecipeError(
-            f"policies/{recipe.name}.yaml has no section `train_agent`: it is not trained by rewards. "
-            f"`mikasa-vla list policies` shows the recipes; `finetune` trains on demonstrations."
-        )
-    data = merge_fields(to_data(recipe.value.train_agent), config.train_agent)
-    value = decode(AgentRecipe, data, where=f"policies/{recipe.name}.yaml, train_agent")
-    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
-
-
 def agent_job(config: AgentConfig) -> AgentJob:
     """Return the training that a configuration asks for, from its beginning.
 
@@ -90,7 +73,7 @@ def agent_job(config: AgentConfig) -> AgentJob:
     row = algorithm(loaded.value.algorithm)
     check_arguments(row, loaded.value.arguments)
     network_fields(row, loaded.value.network)
-    recipe = _in_whole_updates(loaded.value, row)
+    recipe = in_whole_updates(loaded.value, row)
     settings = EnvSettings(
         task=task.id,
         kwargs={} if task.is_base else recipe.env,
@@ -130,46 +113,17 @@ def _device(asked: str, reader: Reader) -> str:
     return "cpu" if asked == "auto" and not reader.cameras else choose_device(asked)
 
 
-def run_folder_of(config: AgentConfig) -> Path:
-    """Return the run folder of a training."""
-    if config.out is not None:
-        return Path(config.out)
-    name = task_spec(config.task).id.replace("/", "-")
-    return Path("runs") / f"{Path(config.policy).stem}-{name}-{config.run_seed}"
-
-
-def compared_fields(recipe: AgentRecipe) -> dict[str, Any]:  # Any: plain data
-    """Return the recipe's fields that weights may depend on."""
-    return {name: value for name, value in to_data(recipe).items() if name not in LOGGERS}
-
-
-def request_sha256(recipe: AgentRecipe, task: str, *, run_seed: int) -> str:
-    """Return a digest of all that the weights depend on."""
-    return digest_of([compared_fields(recipe), task, run_seed])
-
-
-def _in_whole_updates(recipe: AgentRecipe, row: Algorithm) -> AgentRecipe:
-    """Return it with steps in whole updates: the library does no half ones."""
-    unit = recipe.n_envs * steps_per_update(row, recipe.arguments)
-    save = _rounded_up(recipe.save_every_steps, unit)
-    return replace(recipe, steps=_rounded_up(recipe.steps, unit), save_every_steps=save)
-
-
-def _rounded_up(number: int, unit: int) -> int:
-    return math.ceil(number / unit) * unit
-
-
 def _checked_held_out(settings: HeldOutConfig, env: EnvSettings, recipe: AgentRecipe) -> HeldOutConfig:
     """Return when and on what checkpoints are evaluated: on the training's own task."""
     last = settings.seed_start + settings.episodes - 1
-    if settings.seed_start <= EVALUATION_SEEDS[-1] or last >= FIRST_SEED:
+    if settings.seed_start <= EVALUATION_SEEDS[-1] or last >= TRAINING_SEEDS[0]:
         raise RecipeError(
             f"held_out.seed_start={settings.seed_start}, episodes={settings.episodes}: expected seeds above "
-            f"{EVALUATION_SEEDS[-1]}, which tables are made from, and below {FIRST_SEED:,}, from where on "
-            "the training's are."
+            f"{EVALUATION_SEEDS[-1]}, which tables are made from, and below {TRAINING_SEEDS[0]:,}, from where "
+            "on the training's are."
         )
     _refuse_other(settings)
-    every = _rounded_up(settings.every_steps, recipe.save_every_steps)
+    every = rounded_up(settings.every_steps, recipe.save_every_steps)
     return replace(settings, every_steps=every, env=dict(env.kwargs), task=env.task, simulator=env.simulator)
 
 

@@ -19,8 +19,9 @@ import torch
 
 from vla_eval.agents.checkpoints import load_checkpoint, write_checkpoint
 from vla_eval.agents.curve import draw_curve
-from vla_eval.agents.job import AgentJob, agent_job, compared_fields, request_sha256
+from vla_eval.agents.job import AgentJob, agent_job
 from vla_eval.agents.progress import Progress, quiet_logger
+from vla_eval.agents.request import compared_fields, request_sha256
 from vla_eval.agents.simulators import LOGS_FOLDER, simulators
 from vla_eval.agents.vector_env import SlotsEnv
 from vla_eval.config.agents import AgentConfig

@@ -9,13 +9,10 @@ from typing import Any  # the library's infos and indices
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from vla_eval.config.agents import Rewards
+from vla_eval.config.agents import TRAINING_SEEDS, Rewards
 from vla_eval.core import SimEnv, StepResult
 from vla_eval.policies.agents.observing import Reader, Seen, action_space, as_action, space_of
 from vla_eval.seeding import Stream, generator
-
-FIRST_SEED, LAST_SEED = 1_000_000, 2**31 - 1
-"""Training's episodes; tables are made from 1 to 100, checkpoints are evaluated on 900,000 and above."""
 
 
 class Finished:
@@ -101,7 +98,7 @@ class SlotsEnv(VecEnv):
     def _next_seed(self, slot: int) -> int:
         drawn = generator(self._run_seed, Stream.AGENT, self._segment, slot, self._n_begun[slot])
         self._n_begun[slot] += 1
-        return int(drawn.integers(FIRST_SEED, LAST_SEED, endpoint=True))
+        return int(drawn.integers(TRAINING_SEEDS.start, TRAINING_SEEDS.stop))
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute, the same for each slot."""

@@ -75,6 +75,9 @@ def run(args: argparse.Namespace) -> int:
     """Train; lines for a person go to standard error, the checkpoint's folder to standard output."""
     config, command = _config(args), typed_command()
     if args.dry_run:
+        from vla_eval.agents.request import look_for
+
+        look_for(config)
         from vla_eval.agents.dry_run import describe_training
 
         with contextlib.redirect_stdout(sys.stderr):
@@ -95,13 +98,19 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _train(config: AgentConfig, *, command: str) -> "tuple[FinetuneSummary, StopRequest | None]":
+    from vla_eval.agents.request import look_for, run_folder_of
+
+    finished = look_for(config)
+    if finished is not None:
+        print(finished, file=sys.stderr)
+        return finished, None
+    check_writable(run_folder_of(config))
+    # Here and not above: what is finished need not wait for torch.
     from tqdm import tqdm
 
-    from vla_eval.agents.job import run_folder_of
     from vla_eval.agents.train import train_agent
     from vla_eval.cli.terminal.progress import stop_on_signals
 
-    check_writable(run_folder_of(config))
     with stop_on_signals(ANSWER_TO_STOP) as stop, contextlib.redirect_stdout(sys.stderr):
         summary = train_agent(
             config,

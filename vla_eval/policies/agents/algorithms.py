@@ -100,8 +100,9 @@ def network_class(row: Algorithm) -> Any:
 
 def steps_per_update(row: Algorithm, arguments: Mapping[str, Any]) -> int:
     """Return after how many steps of one environment the weights change."""
-    default = inspect.signature(library_class(row).__init__).parameters[row.steps].default
-    found = arguments.get(row.steps, default)
+    found = arguments.get(row.steps)
+    if found is None:
+        found = inspect.signature(library_class(row).__init__).parameters[row.steps].default
     if not isinstance(found, int) or isinstance(found, bool) or found < 1:
         raise RecipeError(
             f"train_agent.arguments.{row.steps} is {found!r}, expected a whole number of steps, 1 or more."

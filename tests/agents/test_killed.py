@@ -1,0 +1,52 @@
+"""A training by rewards that is killed by SIGKILL is resumed by the same command, with the same weights."""
+
+import signal
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs `make rl`")
+
+from tests.agents.test_resuming import files_of
+from tests.agents.tiny_agents import TINY, tiny, trained
+from tests.forked import run_forked
+from vla_eval.config.files import to_data
+
+STEP, WRITING = "in a step", "while a checkpoint is written"
+# Of 24 steps; the first checkpoint is written after 8, the second after 16.
+SCRIPT = """
+import os, signal
+from vla_eval.agents import checkpoints
+from vla_eval.agents.train import train_agent
+from vla_eval.config.agents import AgentConfig
+from vla_eval.strict.decoding import decode
+
+asked = []
+
+def in_a_step():
+    asked.append(None)
+    if {moment!r} == "in a step" and len(asked) == 13:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return False
+
+def while_writing(folder):
+    if {moment!r} != "in a step" and folder.name.endswith("32"):
+        os.kill(os.getpid(), signal.SIGKILL)
+
+checkpoints.sync_tree = while_writing
+train_agent(decode(AgentConfig, {config!r}, where="test"), is_stopping=in_a_step)
+"""
+
+
+@pytest.mark.parametrize("algorithm", [*TINY])
+@pytest.mark.parametrize("moment", [STEP, WRITING])
+def test_a_killed_training_is_resumed_with_the_weights_of_one_that_was_not(
+    algorithm: str, moment: str, tmp_path: Path
+) -> None:
+    config = tiny(algorithm, tmp_path / "run")
+    done = run_forked(SCRIPT.format(moment=moment, config=to_data(config)), tmp_path)
+    assert done.returncode == -signal.SIGKILL, done.stderr
+    found = [folder.name for folder in (tmp_path / "run/train/checkpoints").glob("[0-9.]*")]
+    assert sorted(found) == [".partial-000000032", "000000016"][moment != WRITING :]
+    assert trained(config) == tmp_path / "run"
+    assert files_of(tmp_path / "run") == files_of(trained(tiny(algorithm, tmp_path / "whole")))
