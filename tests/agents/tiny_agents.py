@@ -42,12 +42,12 @@ TINY: dict[str, dict[str, Any]] = {
 def tiny(algorithm: str, out: Path, task: str = ROBOT, **changes: Any) -> AgentConfig:
     """Return a training of an algorithm, of a robot task in the fake simulator."""
     fields = {"env": {}, **TINY[algorithm], **changes.pop("train_agent", {})}
+    fields["simulator"] = "maniskill" if task.startswith("mikasa_base") else "fake"
     is_base = task.startswith("mikasa_base")
     settings: dict[str, Any] = {
         "policy": f"{algorithm}_base" if is_base else algorithm,
         "task": task,
         "out": str(out),
-        "simulator": "maniskill" if is_base else "fake",
         **changes,
     }
     return AgentConfig(train_agent=fields, **settings)

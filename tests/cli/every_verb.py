@@ -23,6 +23,14 @@ FINETUNE = (
     + " ".join(f"--set {field}" for field in TINY_ACT)
 )
 
+TINY_AGENT = (
+    *("n_envs=2", "steps=16", "env={}", "simulator=fake"),
+    *("arguments.n_steps=8", "arguments.batch_size=8", "network.net_arch=[8]"),
+)
+TRAIN_AGENT = f"train-agent --algorithm ppo --task {TASK} " + " ".join(
+    f"--set {field}" for field in TINY_AGENT
+)
+
 # In this order: later ones use what earlier ones leave in {W}.
 COMMANDS = {
     "init": "init {W}/own.yaml",
@@ -49,6 +57,7 @@ COMMANDS = {
     "dataset push": f"dataset push {{W}}/data/{TASK} nobody/nothing",
     "dataset pull": "dataset pull nobody/nothing {W}/pulled",
     "finetune": f"{FINETUNE} --steps 2 --out {{W}}/trained",
+    "train-agent": f"{TRAIN_AGENT} --out {{W}}/agent",
     "checkpoint verify": "checkpoint verify {W}/trained",
     "checkpoint fetch": "checkpoint fetch smolvla_base --out {W}/fetched",
     "checkpoint rehearse": "checkpoint rehearse act --device cpu --out {W}/rehearsed",

@@ -9,7 +9,16 @@ from pathlib import Path
 
 import pytest
 
-from tests.cli.every_verb import COMMANDS, FAKE, FINETUNE, ROOT, TASK, command_line, environment_of
+from tests.cli.every_verb import (
+    COMMANDS,
+    FAKE,
+    FINETUNE,
+    ROOT,
+    TASK,
+    TRAIN_AGENT,
+    command_line,
+    environment_of,
+)
 from tests.waiting import wait_until
 
 MARK = "MIKASA_A_TEST_MARKS"
@@ -26,6 +35,7 @@ LONG = {
     "audit": f"audit --task {TASK} --control hold --protocol paper {MANY} --out {{W}}/audit",
     "probe": f"probe --task {TASK} --policy cue_blind {MANY} --out {{W}}/probe",
     "finetune": f"{FINETUNE} --steps 100000 --out {{W}}/trained",
+    "train-agent": f"{TRAIN_AGENT} --steps 1000000 --workers 2 --out {{W}}/agent",
     "bench --serve": "bench --serve --sessions 2 --seconds 60",
     "doctor": "doctor",
     "view": f"view {{W}}/data/{TASK} --episode 0 --web",

@@ -41,7 +41,7 @@ sys.path[:] = before
 HANGS_AFTER_S = 600.0
 
 WITH_LEROBOT = {
-    *("record", "replay", "finetune", "doctor", "bench --loader", "bench --serve"),
+    *("record", "replay", "finetune", "train-agent", "doctor", "bench --loader", "bench --serve"),
     *("checkpoint verify", "checkpoint rehearse", "checkpoint merge"),
     *("checkpoint convert-octo", "checkpoint convert-openvla", "checkpoint convert-spatialvla"),
     *("view", "serve"),

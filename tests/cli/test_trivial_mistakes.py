@@ -94,6 +94,17 @@ MISTAKES: dict[str, dict[str, str]] = {
         "finetune --policy empty --dataset empty": "empty",
         "finetune --policy smolvla --dataset data/nowhere --base-checkpoint nowhere": "nowhere",
     },
+    "train-agent": {
+        "train-agent nowhere": "nowhere",
+        f"train-agent --algorithm ppoo --task {TASK}": "Did you mean 'ppo'",
+        f"train-agent --algorithm tdmpc2 --task {TASK}": "no package has it",
+        "train-agent --algorithm ppo": "--task is missing",
+        "train-agent --algorithm ppo --task RememberColour3-v0": "RememberColour3-v0",
+        f"train-agent --policy act --task {TASK}": "no section `train_agent`",
+        f"train-agent --algorithm ppo --task {TASK} --observation stat": "expected 'state'",
+        f"train-agent --algorithm ppo --task {TASK} --set env.control_mode=pd_jont_pos": "pd_joint_pos",
+        f"train-agent --algorithm ppo --task {TASK} --set gama=0.9": "gama",
+    },
     "checkpoint": {
         "checkpoint verify runs/nowhere": "runs/nowhere",
         "checkpoint verify empty": "empty",
@@ -130,7 +141,7 @@ import vla_eval.cli.main as cli
 import importlib
 import numpy  # which most commands load: once is enough
 for verb in cli.VERBS:
-    importlib.import_module(f"vla_eval.cli.{verb}")  # what `mikasa-vla --help` loads
+    importlib.import_module(f"vla_eval.cli.{verb.replace('-', '_')}")  # what `mikasa-vla --help` loads
 heavy, commands = json.loads(sys.argv[1]), json.loads(sys.argv[2])
 for command in commands:
     reader, writer = os.pipe()

@@ -77,7 +77,7 @@ def agent_job(config: AgentConfig) -> AgentJob:
     settings = EnvSettings(
         task=task.id,
         kwargs={} if task.is_base else recipe.env,
-        simulator=config.simulator,
+        simulator=recipe.simulator,
         n_slots=recipe.n_envs,
     )
     env = describe_env(settings)
@@ -119,8 +119,8 @@ def _checked_held_out(settings: HeldOutConfig, env: EnvSettings, recipe: AgentRe
     if settings.seed_start <= EVALUATION_SEEDS[-1] or last >= TRAINING_SEEDS[0]:
         raise RecipeError(
             f"held_out.seed_start={settings.seed_start}, episodes={settings.episodes}: expected seeds above "
-            f"{EVALUATION_SEEDS[-1]}, which tables are made from, and below {TRAINING_SEEDS[0]:,}, from where "
-            "on the training's are."
+            f"{EVALUATION_SEEDS[-1]}, which tables are made from, and below {TRAINING_SEEDS[0]:,}, from "
+            "where on the training's are."
         )
     _refuse_other(settings)
     every = rounded_up(settings.every_steps, recipe.save_every_steps)

@@ -237,7 +237,6 @@ def _open(job: AgentJob, command: str) -> Path | None:
     settings: dict[str, Any] = {  # Any: plain data
         "finetune": compared_fields(job.recipe),
         "task": job.task,
-        "simulator": job.settings.simulator,
         "run_seed": job.run_seed,
     }
     record: dict[str, Any] = {  # Any: plain data

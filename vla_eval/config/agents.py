@@ -35,6 +35,7 @@ class AgentRecipe:
     network: dict[str, Any] = field(default_factory=dict)
     anneal_lr: bool = False  # the learning rate falls to zero by the last step
     tensorboard: bool = False
+    simulator: Simulator = "maniskill"
 
     def __post_init__(self) -> None:
         check_bounds(self, prefix="train_agent.")
@@ -51,7 +52,6 @@ class AgentConfig:
     # fields of the recipe's section, set to other values; Any: decoded as an AgentRecipe
     train_agent: dict[str, Any] = field(default_factory=dict)
     device: str = "auto"
-    simulator: Simulator = "maniskill"
     workers: Workers = "auto"  # processes that simulate; moves no result
     held_out: HeldOutConfig | None = None  # None: no checkpoint is evaluated during training
 
