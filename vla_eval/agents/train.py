@@ -205,15 +205,16 @@ def described(job: AgentJob, model: Any) -> list[str]:
     if not job.algorithm.replays and collected % batch:
         lines.append(f"note: the last batch of each pass has {collected % batch} of {batch} steps")
     n_bytes = _buffer_bytes(model)
-    if n_bytes:
-        lines.append(f"memory: {n_bytes / 1e9:.2f} GB for collected steps")
-    return lines
+    return [*lines, f"memory: {n_bytes / 1e6:,.0f} MB for collected steps"]
 
 
 def _buffer_bytes(model: Any) -> int:
-    buffer = getattr(model, "replay_buffer", None) or getattr(model, "rollout_buffer", None)
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is None:
+        buffer = model.rollout_buffer
+        buffer.reset()  # which makes its arrays
     found = 0
-    for value in vars(buffer).values() if buffer is not None else ():
+    for value in vars(buffer).values():
         for part in value.values() if isinstance(value, dict) else (value,):
             found += part.nbytes if isinstance(part, np.ndarray) else 0
     return found

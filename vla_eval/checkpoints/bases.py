@@ -82,6 +82,11 @@ def how_to_get(path: str | Path) -> str:
 
 def no_weights(recipe: str) -> CheckpointError:
     """Build the error for a recipe that says how a policy is trained, and has no weights yet."""
+    if recipe in list_recipes("policies") and load_policy(recipe).value.train_agent is not None:
+        return CheckpointError(
+            f"policy '{recipe}' has no weights: its recipe says how it learns by rewards. Run `mikasa-vla "
+            f"train-agent --policy {recipe} --task TASK --out RUN`, then `mikasa-vla eval --policy RUN`."
+        )
     base = base_of_recipe(recipe)
     first = "" if base is None else f" It starts from a base: first `mikasa-vla checkpoint fetch {base}`."
     return CheckpointError(

@@ -45,6 +45,7 @@ from vla_eval.checkpoints.processors import check_statistics, load_processors, o
 from vla_eval.checkpoints.saved_processor import refuse_built_in_normalization
 from vla_eval.errors import CheckpointError, VlaEvalError, unknown_name
 from vla_eval.models.families import family_of, register_families
+from vla_eval.models.family import LEROBOT
 from vla_eval.models.weights.empty import empty_weights
 from vla_eval.models.weights.exact import check_same, put_weights
 from vla_eval.models.weights.file import WeightFile
@@ -152,12 +153,18 @@ def config_class(kind: str, *, where: str) -> Any:
     register_families()
     _register_plugins(_search_path())
     known = list(PreTrainedConfig.get_known_choices())
+    family = family_of(kind)
+    if family.adapter != LEROBOT:
+        raise CheckpointError(
+            f"{where}: '{kind}' is no policy of LeRobot's: {family.why_not}. `mikasa-vla eval --policy "
+            f"FOLDER` evaluates it; see {family.docs}."
+        )
     if kind not in known:
         error = unknown_name("LeRobot policy type", kind[:100], known, where=where)
         raise CheckpointError(
             f"{error} A policy of your own has to be installed as a package `lerobot_policy_…`."
         )
-    why_not = family_of(kind).why_not
+    why_not = family.why_not
     if why_not:
         raise CheckpointError(
             f"{where}: a LeRobot policy of type '{kind}' cannot be evaluated in this loop, which asks for "

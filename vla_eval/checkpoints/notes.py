@@ -21,11 +21,12 @@ from vla_eval.checkpoints.policy_types import asked_for_steps, check_compiled
 from vla_eval.checkpoints.saved_processor import SavedStep, read_saved_processor
 from vla_eval.errors import CheckpointError, RecipeError
 from vla_eval.models.families import FAMILIES
+from vla_eval.models.family import LEROBOT
 from vla_eval.models.shared.step_names import DECODER_STEP, ENCODER_STEP, STATISTICS
 from vla_eval.seeding import SeedRange
 from vla_eval.strict.json_fields import get_count, get_mapping, get_text
 
-LEROBOT_ADAPTER = "lerobot"
+LEROBOT_ADAPTER = LEROBOT
 LEROBOT_CHECKPOINTS = frozenset(
     {
         LEROBOT_ADAPTER,

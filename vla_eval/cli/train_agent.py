@@ -90,10 +90,11 @@ def run(args: argparse.Namespace) -> int:
             f"Stopped; step {summary.step:,} is saved in {summary.out}. To resume: {command}", file=sys.stderr
         )
         return stop.exit_code
+    from vla_eval.cli.shared.folders import agent_evaluation
     from vla_eval.cli.shared.output import hint_next
 
     print(summary.checkpoint, flush=True)
-    hint_next("eval", "--task", config.task, "--policy", summary.out)
+    hint_next(*agent_evaluation(summary.out) or ())
     return 0
 
 

@@ -5,6 +5,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal  # Any: fields of a configuration, and what a row names
 
+LEROBOT = "lerobot"
+"""The adapter of LeRobot's policies."""
 Noise = Literal["flow", "ddim"]
 """What an inference draws and can be given: `flow`: a chunk of actions as wide as the model's; `ddim`: the
 horizon of a diffusion policy whose scheduler draws nothing further."""
@@ -89,7 +91,7 @@ class Family:
     # function `(source, options)` that makes an `Original` of a published checkpoint
     converter: str = ""
     convert_options: str = ""  # the class of its options, whose fields are also the verb's flags
-    adapter: str = "lerobot"  # what runs a checkpoint of it that is named by its folder
+    adapter: str = LEROBOT  # what runs a checkpoint of it that is named by its folder
     # further adapters of its checkpoints: name -> `module:attribute`, see `policies.registry`
     adapters: Mapping[str, str] = field(default_factory=dict)
     tiny: Tiny | None = None  # its form in a table of tiny models; None: there is none

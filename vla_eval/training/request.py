@@ -45,8 +45,11 @@ def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
         raise RecipeError(_no_recipe(Path(name)))
     recipe = load_policy(name)
     if recipe.value.finetune is None:
+        instead = "there is nothing to train"
+        if recipe.value.train_agent is not None:
+            instead = f"it learns by rewards: mikasa-vla train-agent --policy {recipe.name} --task TASK"
         raise RecipeError(
-            f"policies/{recipe.name}.yaml has no section `finetune`: there is nothing to train. "
+            f"policies/{recipe.name}.yaml has no section `finetune`: {instead}. "
             f"`mikasa-vla list policies` shows the recipes."
         )
     data = merge_fields(to_data(recipe.value.finetune), config.finetune)

@@ -15,8 +15,11 @@ from vla_eval.errors import RunFolderError, some_of
 from vla_eval.storage.folders import kind_of, what_is
 from vla_eval.storage.run_file import RUN_FILE
 from vla_eval.storage.run_folder import read_run
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.run_folder import RUN_FILE as TRAINING_FILE
 from vla_eval.training.run_folder import newest_step, read_record
+
+AGENT_KEY = "observation"  # of the description of a training by rewards
 
 type Lines = Iterator[tuple[str, str]]  # label, text
 
@@ -36,13 +39,28 @@ def folder_lines(folder: Path) -> Lines:
             yield kind.word, str(folder)
             yield from kind.lines(folder)
             for index, step in enumerate(kind.next_steps):
-                yield "" if index else "next", step.format(folder=shlex.quote(str(folder)))
+                words = agent_evaluation(folder) if kind.word == "training" else None
+                command = None if words is None else shlex.join(["mikasa-vla", *words])
+                yield "" if index else "next", command or step.format(folder=shlex.quote(str(folder)))
             return
     found = some_of(sorted(os.listdir(folder))) or "nothing"
     raise RunFolderError(
         f"{folder}: expected a run ({RUN_FILE}), a training ({TRAINING_FILE}), a dataset ({INFO_FILE}) or a "
         f"checkpoint ({CONFIG_FILE} and weights); found {found}.{what_is(folder)}"
     )
+
+
+def agent_evaluation(folder: Path) -> tuple[str, ...] | None:
+    """Return the words of the command that evaluates an agent of this run; None: it is of another kind."""
+    record = read_record(folder)
+    if AGENT_KEY not in record:
+        return None
+    tasks, env = record.get("tasks"), record.get("env")
+    task = str(tasks[0]) if isinstance(tasks, list) and tasks else "TASK"
+    control = "memoryless" if task != "TASK" and task_spec(task).is_base else "cue_blind"
+    sets = [("--set", f"env.{name}={value}") for name, value in (env or {}).items()]
+    flags = ("--task", task, "--policy", str(folder), control, "oracle")
+    return ("eval", *flags, *(word for pair in sets for word in pair))
 
 
 def _of_run(folder: Path) -> Lines:
