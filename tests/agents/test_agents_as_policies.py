@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file
 
 pytest.importorskip("stable_baselines3", reason="needs `make rl`")
 
@@ -200,6 +201,21 @@ def test_a_dry_run_says_what_it_takes_and_writes_nothing(
     said = capsys.readouterr().out
     assert "weights" in said and "steps/s here" in said
     assert not (tmp_path / "run").exists()
+
+
+def test_a_network_that_diverges_ends_the_training_and_is_not_saved(tmp_path: Path) -> None:
+    fields = {"arguments": {**TINY["ppo"]["arguments"], "learning_rate": 1e30, "max_grad_norm": 1e30}}
+    with pytest.raises(VlaEvalError, match="has diverged by step"):
+        train_agent(tiny("ppo", tmp_path / "run", train_agent=fields))
+    for file in (tmp_path / "run").rglob("model.safetensors"):
+        assert all(torch.isfinite(tensor).all() for tensor in load_file(file).values())
+
+
+def test_arguments_of_a_task_without_a_robot_are_kept(tmp_path: Path) -> None:
+    env = {"horizon_steps": 7, "control_mode": "pd_joint_delta_pos"}
+    run = trained(tiny("ppo", tmp_path / "run", BIT, train_agent={"env": env, "steps": 16}))
+    about = json.loads((run / "train/checkpoints/last/pretrained_model/config.json").read_text())
+    assert about["env"] == {"horizon_steps": 7}
 
 
 def test_the_memory_for_collected_steps_is_said_before(tmp_path: Path) -> None:

@@ -3,15 +3,15 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 from vla_eval.agents.request import in_whole_updates, load_agent_recipe, rounded_up, run_folder_of
 from vla_eval.base_tasks.named import DISCRETE
-from vla_eval.checkpoints.files import MODEL_FOLDER
 from vla_eval.config.agents import TRAINING_SEEDS, AgentConfig, AgentRecipe
 from vla_eval.config.dataset import EVALUATION_SEEDS
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import HeldOutConfig
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.envs.factory import describe_env
 from vla_eval.errors import RecipeError
 from vla_eval.policies.agents.algorithms import (
@@ -53,11 +53,6 @@ class AgentJob:
         return 0 if self.resume_from is None else int(self.resume_from.name)
 
     @property
-    def weights(self) -> Path | None:
-        """Folder of the network to continue with; None: from scratch."""
-        return None if self.resume_from is None else self.resume_from / MODEL_FOLDER
-
-    @property
     def steps_per_update(self) -> int:
         """Steps of all environments together between two changes of the weights."""
         return self.recipe.n_envs * steps_per_update(self.algorithm, self.recipe.arguments)
@@ -76,7 +71,7 @@ def agent_job(config: AgentConfig) -> AgentJob:
     recipe = in_whole_updates(loaded.value, row)
     settings = EnvSettings(
         task=task.id,
-        kwargs={} if task.is_base else recipe.env,
+        kwargs=_without_arm(recipe.env) if task.is_base else recipe.env,
         simulator=recipe.simulator,
         n_slots=recipe.n_envs,
     )
@@ -106,6 +101,11 @@ def agent_job(config: AgentConfig) -> AgentJob:
         held_out=held_out,
         workers=config.workers,
     )
+
+
+def _without_arm(env: Mapping[str, Any]) -> dict[str, Any]:  # Any: arguments of a task
+    """Return the arguments without that of a robot: one recipe is for tasks of both kinds."""
+    return {name: value for name, value in env.items() if name != CONTROL_MODE}
 
 
 def _device(asked: str, reader: Reader) -> str:

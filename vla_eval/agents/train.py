@@ -29,7 +29,7 @@ from vla_eval.config.files import to_data
 from vla_eval.errors import TrainingError
 from vla_eval.policies.agents.algorithms import asked_of_library, library_class, network_class, network_fields
 from vla_eval.seeding import global_generators_kept, seed_global_generators
-from vla_eval.storage.provenance import collect_environment
+from vla_eval.storage.provenance import collect_environment, package_version
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.held_out import HeldOut
 from vla_eval.training.request import FinetuneSummary
@@ -43,6 +43,7 @@ from vla_eval.training.run_folder import (
     read_metrics,
 )
 
+LIBRARIES = ("stable-baselines3", "sb3-contrib")
 Say = Callable[[str], None]
 """Takes a line for a person."""
 
@@ -110,9 +111,24 @@ def _segment(job: AgentJob, model: Any, envs: SlotsEnv, progress: Progress) -> b
             for state in states:
                 state.zero_()
     goal = min(first + job.recipe.save_every_steps, job.recipe.steps)
-    interval = 1 if not job.algorithm.replays else max(1, job.recipe.n_envs)
-    model.learn(goal - first, callback=progress, log_interval=interval, reset_num_timesteps=False)
+    interval = job.recipe.n_envs if job.algorithm.replays else 1  # episodes, or updates
+    try:
+        model.learn(goal - first, callback=progress, log_interval=interval, reset_num_timesteps=False)
+    except ValueError as exc:
+        if not str(exc).startswith("Expected parameter"):  # torch's, of a distribution whose numbers are none
+            raise
+        raise _diverged(job, model) from exc
+    if not all(bool(torch.isfinite(weight).all()) for weight in model.policy.parameters()):
+        raise _diverged(job, model)
     return not progress.was_stopped
+
+
+def _diverged(job: AgentJob, model: Any) -> TrainingError:
+    return TrainingError(
+        f"{job.out}: the network has diverged by step {model.num_timesteps:,}: its numbers are not finite. "
+        "The checkpoints before are whole. Train with a lower train_agent.arguments.learning_rate, in "
+        "another --out."
+    )
 
 
 def _seed(job: AgentJob, step: int) -> int:
@@ -132,19 +148,19 @@ def make_model(job: AgentJob, envs: SlotsEnv) -> Any:
         # by the steps that are done: the library's own measure starts again at each checkpoint
         arguments["learning_rate"] = lambda _progress: rate * (1 - _done(made, job))
     made: list[Any] = []
-    warnings.filterwarnings(
-        "ignore", "You have specified a mini-batch size", UserWarning
-    )  # `described` says it
-    model = asked_of_library(
-        lambda: cls(
-            network_class(row),
-            envs,
-            policy_kwargs=network_fields(row, recipe.network),
-            device=job.device,
-            **arguments,
-        ),
-        where=f"policies/{job.name}.yaml, train_agent",
-    )
+    with warnings.catch_warnings():
+        # What `described` says.
+        warnings.filterwarnings("ignore", "You have specified a mini-batch size", UserWarning)
+        model = asked_of_library(
+            lambda: cls(
+                network_class(row),
+                envs,
+                policy_kwargs=network_fields(row, recipe.network),
+                device=job.device,
+                **arguments,
+            ),
+            where=f"policies/{job.name}.yaml, train_agent",
+        )
     made.append(model)
     gc.freeze()  # what was imported meanwhile, too
     return model
@@ -247,6 +263,7 @@ def _open(job: AgentJob, command: str) -> Path | None:
         "observation": job.reader.mode,
         "env": to_data(dict(job.settings.kwargs)),
         "environment": collect_environment(),
+        "libraries": {name: package_version(name) for name in LIBRARIES},
         "command": command,
         REQUEST_KEY: request_sha256(job.recipe, job.task, run_seed=job.run_seed),
     }

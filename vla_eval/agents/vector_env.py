@@ -15,8 +15,8 @@ from vla_eval.policies.agents.observing import Reader, Seen, action_space, as_ac
 from vla_eval.seeding import Stream, generator
 
 
-class Finished:
-    """An episode that has ended in training."""
+class EpisodeTotals:
+    """What an episode of the training adds up to."""
 
     def __init__(self) -> None:
         self.episode_return, self.success, self.n_steps = 0.0, False, 0
@@ -40,9 +40,9 @@ class SlotsEnv(VecEnv):
         self._env, self._reader, self._reward, self._run_seed = env, reader, reward, run_seed
         self._segment = 0
         self._n_begun = [0] * n_slots
-        self._episodes = [Finished() for _ in range(n_slots)]
+        self._episodes = [EpisodeTotals() for _ in range(n_slots)]
         self._actions: np.ndarray[Any, Any] = np.zeros(0)
-        self.finished: list[Finished] = []
+        self.finished: list[EpisodeTotals] = []
         self._slots = tuple(range(n_slots))
         example = self._begin(self._slots)[0]
         super().__init__(n_slots, space_of(example), action_space(env.spec.action))
@@ -92,7 +92,7 @@ class SlotsEnv(VecEnv):
         seeds = {slot: self._next_seed(slot) for slot in slots}
         results = self._env.reset(seeds, render=bool(self._reader.cameras))
         for slot in slots:
-            self._episodes[slot] = Finished()
+            self._episodes[slot] = EpisodeTotals()
         return {slot: self._reader.read(results[slot].observation) for slot in slots}
 
     def _next_seed(self, slot: int) -> int:
