@@ -14,6 +14,7 @@ pytest.importorskip("stable_baselines3", reason="needs `make rl`")
 from tests.agents.tiny_agents import BIT, ROBOT, TINY, tiny, trained
 from vla_eval.agents.train import train_agent
 from vla_eval.cli.main import main
+from vla_eval.cli.shared.folders import agent_evaluation
 from vla_eval.config.finetuning import HeldOutConfig
 from vla_eval.errors import MissingDependencyError, SpecMismatchError, VlaEvalError
 from vla_eval.serving.host import HostOptions, host_policy
@@ -241,7 +242,19 @@ def test_the_command_trains_and_prints_the_checkpoint(
     assert main([*command, *sizes, "--out", str(tmp_path / "run")]) == 0
     said = capsys.readouterr()
     assert said.out.strip().endswith("pretrained_model")
-    assert "step 64/64" in said.err and f"eval --task {BIT}" in said.err
+    asks = f"eval --task {BIT} --policy {tmp_path / 'run'} memoryless oracle"
+    assert "step 64/64" in said.err and asks in said.err
+    assert main(["show", str(tmp_path / "run")]) == 0
+    assert asks in _all(capsys)
+    assert main([*command, *sizes, "--out", str(tmp_path / "run")]) == 0  # once more: it is finished
+    assert "has all of its 64 steps" in _all(capsys)
+
+
+def test_the_next_command_of_a_robot_s_agent_sets_what_it_was_trained_in(tmp_path: Path) -> None:
+    about = {"format_version": 1, "observation": "state", "tasks": [ROBOT], "env": {"delay_steps": 7}}
+    (tmp_path / "finetune.json").write_text(json.dumps(about))
+    words = agent_evaluation(tmp_path)
+    assert words is not None and words[-4:] == ("cue_blind", "oracle", "--set", "env.delay_steps=7")
 
 
 def test_a_sequence_at_once_is_what_the_library_does_step_by_step() -> None:

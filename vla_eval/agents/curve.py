@@ -22,6 +22,7 @@ def draw_curve(out: Path, lines: Sequence[Mapping[str, Any]], *, name: str, task
     # Without pyplot, whose state is the whole process's.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter, MaxNLocator
 
     keys = ["episode_return", *(["success"] if any(line.get("success") for line in lines) else [])]
     figure = Figure(figsize=(4.6 * len(keys), 3.2), layout="constrained")
@@ -33,6 +34,8 @@ def draw_curve(out: Path, lines: Sequence[Mapping[str, Any]], *, name: str, task
         chance = task_spec(task).chance_success
         if key == "success" and chance is not None:
             axes.axhline(chance, color="#888888", linestyle=":", label=f"chance {chance:.2f}")
+        axes.xaxis.set_major_locator(MaxNLocator(6))
+        axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         axes.set_xlabel("control steps of all environments")
         axes.set_ylabel("return of an episode" if key == "episode_return" else "success_once")
         axes.legend(fontsize=7)
