@@ -3,9 +3,12 @@
 import argparse
 import contextlib
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import (
+    MANY,
+    NUMBERS,
     add_flags,
     env_paths,
     read_config,
@@ -28,8 +31,9 @@ DESCRIPTION = """Train an agent by rewards, without demonstrations: PPO, PPO-LST
 --algorithm takes the recipe of that name that fits the task; --policy NAME takes another one in policies/
 with a `train_agent` section, for example ppo_published. CONFIG is a file with fields `policy`, `task`,
 `out`, `run_seed`, `train_agent`, `held_out`. --set changes a field of the recipe's section
-(--set arguments.gamma=0.9). The same command again resumes it exactly, also after a kill, from its last
-checkpoint. Then: mikasa-vla eval --policy RUN --task TASK"""
+(--set arguments.gamma=0.9). Several algorithms, tasks or run seeds are trained one after another (with
+--shard beside each other), and evaluated together. The same command again resumes it exactly, also after a
+kill, from the last checkpoint. Then: mikasa-vla eval --policy RUN --task TASK"""
 
 EPILOG = """docs/agents.md explains recipes, observations, resuming. Exit codes: 0 trained to the last step;
 1 a mistake; 130, 143 stopped by Ctrl-C, SIGTERM (the same command resumes from the last checkpoint)."""
@@ -41,9 +45,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--algorithm", metavar="A", help="ppo, ppo_lstm, sac")
-    which.add_argument("--policy", metavar="NAME", help="recipe in policies/ with a `train_agent` section")
-    parser.add_argument("--task", type=task_argument, metavar="T", help="task id")
+    which.add_argument("--algorithm", **MANY, dest="algorithms", metavar="A", help="ppo, ppo_lstm, sac")
+    which.add_argument(
+        "--policy",
+        **MANY,
+        dest="policies",
+        metavar="NAME",
+        help="recipe in policies/ with a `train_agent` section",
+    )
+    parser.add_argument("--task", **MANY, type=task_argument, dest="tasks", metavar="T", help="task ids")
     parser.add_argument(
         "--observation",
         metavar="O",
@@ -55,7 +65,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--n-envs", type=int, metavar="E", help="environments side by side (the recipe's)")
     parser.add_argument(
-        "--run-seed", type=int, metavar="S", help="seed of weights, exploration and episodes (0)"
+        "--run-seed",
+        **NUMBERS,
+        dest="run_seeds",
+        metavar="S",
+        help="seeds of weights, exploration and episodes (0)",
     )
     parser.add_argument("--device", metavar="D", help="auto, cpu, cuda")
     parser.add_argument(
@@ -67,35 +81,76 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--held-out-episodes", type=int, metavar="E", help="episodes of each such evaluation (20)"
     )
-    parser.add_argument("--out", metavar="DIR", help="run folder (runs/POLICY-TASK-SEED)")
-    add_flags(parser, "--workers", "--dry-run", set="change any field of the recipe's `train_agent` section")
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        help="run folder (runs/POLICY-TASK-SEED); of several: their folder (runs/agents)",
+    )
+    add_flags(
+        parser,
+        *("--workers", "--dry-run"),
+        shard="of several trainings, only every N-th from the I-th on",
+        set="change any field of the recipe's `train_agent` section",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
-    """Train; lines for a person go to standard error, the checkpoint's folder to standard output."""
-    config, command = _config(args), typed_command()
+    """Train; lines for a person go to standard error, checkpoints' folders to standard output."""
+    configs, command = _configs(args), typed_command()
+    if len(configs) > 1:
+        return _run_several(args, configs, command)
+    if args.shard is not None:
+        raise RecipeError("--shard is for several trainings; this is one. Leave it out.")
+    (config,) = configs
     if args.dry_run:
-        from vla_eval.agents.request import look_for
-
-        look_for(config)
-        from vla_eval.agents.dry_run import describe_training
-
-        with contextlib.redirect_stdout(sys.stderr):
-            lines = describe_training(config)
-        print("\n".join(lines))
+        _describe(config)
         return 0
     summary, stop = _train(config, command=command)
     if stop is not None:
-        print(
-            f"Stopped; step {summary.step:,} is saved in {summary.out}. To resume: {command}", file=sys.stderr
-        )
-        return stop.exit_code
+        return _stopped(summary, stop, command)
     from vla_eval.cli.shared.folders import agent_evaluation
     from vla_eval.cli.shared.output import hint_next
 
     print(summary.checkpoint, flush=True)
     hint_next(*agent_evaluation(summary.out) or ())
     return 0
+
+
+def _describe(config: AgentConfig) -> None:
+    from vla_eval.agents.request import look_for
+
+    look_for(config)
+    from vla_eval.agents.dry_run import describe_training
+
+    with contextlib.redirect_stdout(sys.stderr):
+        lines = describe_training(config)
+    print("\n".join(lines))
+
+
+def _run_several(args: argparse.Namespace, configs: list[AgentConfig], command: str) -> int:
+    from vla_eval.agents.several import in_folders, of_shard, write_evaluation
+    from vla_eval.cli.shared.output import hint_next
+
+    out = Path(args.out or "runs/agents")
+    placed = in_folders(configs, out)
+    own = of_shard(placed, args.shard)
+    if args.dry_run:
+        for one in own:
+            _describe(one)
+        return 0
+    for number, one in enumerate(own, 1):
+        print(f"training {number} of {len(own)}: {one.out}", file=sys.stderr)
+        summary, stop = _train(one, command=command)
+        if stop is not None:
+            return _stopped(summary, stop, command)
+        print(summary.checkpoint, flush=True)
+    hint_next("eval", write_evaluation(placed, out), "--out", out / "evaluation")
+    return 0
+
+
+def _stopped(summary: "FinetuneSummary", stop: "StopRequest", command: str) -> int:
+    print(f"Stopped; step {summary.step:,} is saved in {summary.out}. To resume: {command}", file=sys.stderr)
+    return stop.exit_code
 
 
 def _train(config: AgentConfig, *, command: str) -> "tuple[FinetuneSummary, StopRequest | None]":
@@ -122,10 +177,26 @@ def _train(config: AgentConfig, *, command: str) -> "tuple[FinetuneSummary, Stop
     return summary, None if summary.is_finished else stop
 
 
-def _config(args: argparse.Namespace) -> AgentConfig:
+def _configs(args: argparse.Namespace) -> list[AgentConfig]:
+    """Return a training for each recipe, task and run seed."""
+    named = args.algorithms or args.policies or [None]
+    return [
+        _config(args, name, task, run_seed)
+        for name in named
+        for task in args.tasks or [None]
+        for run_seed in args.run_seeds or [None]
+    ]
+
+
+def _config(
+    args: argparse.Namespace, name: str | None, task: str | None, run_seed: int | None
+) -> AgentConfig:
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
-        set_flags(data, args, ("policy", "task", "run_seed", "device", "out", "workers"))
+        set_flags(data, args, ("device", "out", "workers"))
         for path, value in (
+            ("task", task),
+            ("run_seed", run_seed),
+            ("policy", None if args.algorithms else name),
             ("held_out.every_steps", args.held_out_every),
             ("held_out.episodes", args.held_out_episodes),
             ("train_agent.observation", args.observation),
@@ -135,13 +206,11 @@ def _config(args: argparse.Namespace) -> AgentConfig:
         ):
             if value is not None:
                 set_field(AgentConfig, data, path, value, where="command line")
-        if isinstance(
-            data.setdefault("train_agent", {}), dict
-        ):  # anything else is refused when it is decoded
-            free = env_paths(args.overrides)
-            apply_overrides(data["train_agent"], args.overrides, cls=AgentRecipe, free=free)
-        if args.algorithm is not None and "task" in data:
-            data["policy"] = _recipe_of(args.algorithm, data["task"])
+        section = data.setdefault("train_agent", {})
+        if isinstance(section, dict):  # anything else is refused when it is decoded
+            apply_overrides(section, args.overrides, cls=AgentRecipe, free=env_paths(args.overrides))
+        if args.algorithms and name is not None and "task" in data:
+            data["policy"] = _recipe_of(name, data["task"])
 
     return read_config(
         AgentConfig,

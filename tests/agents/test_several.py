@@ -1,0 +1,93 @@
+"""Several trainings of one call: each has its folder, shards part them, one evaluation compares them."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("stable_baselines3", reason="needs `make rl`")
+
+from tests.agents.tiny_agents import BIT, ROBOT
+from vla_eval.agents.several import evaluation, in_folders, of_shard
+from vla_eval.cli.main import main
+from vla_eval.config.agents import AgentConfig
+from vla_eval.errors import RecipeError
+from vla_eval.storage.run_folder import read_run
+from vla_eval.storage.shard import Shard
+
+pytestmark = pytest.mark.usefixtures("light_workers")
+
+SIZES = ("n_envs=2", "steps=32", "save_every_steps=16", "arguments.n_steps=8", "arguments.batch_size=8")
+TINY = [word for field in (*SIZES, "network.net_arch=[8]") for word in ("--set", field)]
+
+
+def grid(*tasks: str, policies: tuple[str, ...] = ("ppo_base", "ppo_lstm_base")) -> list[AgentConfig]:
+    return [
+        AgentConfig(policy=policy, task=task, run_seed=seed)
+        for policy in policies
+        for task in tasks
+        for seed in (0, 1)
+    ]
+
+
+def test_they_are_trained_and_evaluated_together_with_a_run_per_seed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "agents"
+    command = ["train-agent", "--algorithm", "ppo", "ppo_lstm", "--task", BIT, "--run-seed", "0", "1"]
+    assert main([*command, *TINY, "--out", str(out)]) == 0
+    said = capsys.readouterr()
+    assert len(said.out.split()) == 4 and f"eval {out}/eval.yaml --out {out}/evaluation" in said.err
+    flags = ["--episodes", "2", "--workers", "1", "--out", str(tmp_path / "run")]
+    assert main(["eval", str(out / "eval.yaml"), *flags]) == 0
+    counted = {}
+    for record in read_run(tmp_path / "run").records:
+        counted.setdefault(record.policy, set()).add(record.run)
+    assert counted["ppo"] == counted["ppo_lstm"] == {0, 1}
+    assert {"random", "memoryless", "oracle"} < counted.keys()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 20])
+def test_shards_part_the_trainings(count: int, tmp_path: Path) -> None:
+    placed = in_folders(grid(BIT, "mikasa_base/T-Maze-v0"), tmp_path)
+    parts = [of_shard(placed, Shard(number=number, count=count)) for number in range(1, count + 1)]
+    found = [one for part in parts for one in part]
+    assert sorted(found, key=placed.index) == placed
+    assert max(map(len, parts)) - min(map(len, parts)) <= 1
+
+
+def test_each_has_a_folder_of_its_own_and_a_policy_one_entry_per_task(tmp_path: Path) -> None:
+    tasks = (BIT, "mikasa_base/T-Maze-v0")
+    placed = in_folders(grid(*tasks), tmp_path)
+    assert len({one.out for one in placed}) == 8
+    config = evaluation(placed)
+    assert config.tasks == tasks and len(config.policies) == 4 + 3
+    assert all(entry.count(",") == 1 for entry in config.policies[:4])
+
+
+def test_a_robot_s_agents_are_evaluated_in_what_they_were_trained_in(tmp_path: Path) -> None:
+    placed = in_folders(grid(ROBOT, policies=("ppo", "sac")), tmp_path)
+    config = evaluation(placed)
+    assert config.env == {"control_mode": "pd_joint_delta_pos"} and "cue_blind" in config.policies
+
+
+@pytest.mark.parametrize(
+    ("configs", "message"),
+    [
+        (grid(BIT, ROBOT), "cannot be evaluated together"),
+        ([*grid(BIT), grid(BIT)[0]], "two of these trainings are the same"),
+        (
+            [*grid(ROBOT, policies=("ppo",)), AgentConfig(policy="sac", task=ROBOT, train_agent={"env": {}})],
+            "expected the same for all recipes",
+        ),
+    ],
+)
+def test_what_does_not_go_together_is_refused(
+    configs: list[AgentConfig], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(RecipeError, match=message):
+        in_folders(configs, tmp_path)
+
+
+def test_a_shard_of_one_training_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["train-agent", "--algorithm", "ppo", "--task", BIT, "--shard", "1/2"]) == 1
+    assert "--shard is for several trainings" in capsys.readouterr().err
