@@ -1,5 +1,6 @@
 """A training by rewards that is killed by SIGKILL is resumed by the same command, with the same weights."""
 
+import itertools
 import signal
 from pathlib import Path
 
@@ -38,8 +39,16 @@ train_agent(decode(AgentConfig, {config!r}, where="test"), is_stopping=in_a_step
 """
 
 
-@pytest.mark.parametrize("algorithm", [*TINY])
-@pytest.mark.parametrize("moment", [STEP, WRITING])
+IN_EVERY_RUN = {*((algorithm, STEP) for algorithm in TINY), ("ppo", WRITING)}
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "moment"),
+    [
+        pytest.param(*case, marks=() if case in IN_EVERY_RUN else pytest.mark.slow)
+        for case in itertools.product(TINY, (STEP, WRITING))
+    ],
+)
 def test_a_killed_training_is_resumed_with_the_weights_of_one_that_was_not(
     algorithm: str, moment: str, tmp_path: Path
 ) -> None:
