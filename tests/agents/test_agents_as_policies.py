@@ -20,7 +20,7 @@ from vla_eval.errors import MissingDependencyError, SpecMismatchError, VlaEvalEr
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.storage.run_folder import read_run
 
-pytestmark = pytest.mark.usefixtures("light_workers")
+pytestmark = pytest.mark.usefixtures("in_this_process", "light_workers")
 
 
 @pytest.fixture(scope="module")

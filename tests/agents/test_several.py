@@ -14,7 +14,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.storage.run_folder import read_run
 from vla_eval.storage.shard import Shard
 
-pytestmark = pytest.mark.usefixtures("light_workers")
+pytestmark = pytest.mark.usefixtures("in_this_process", "light_workers")
 
 SIZES = ("n_envs=2", "steps=32", "save_every_steps=16", "arguments.n_steps=8", "arguments.batch_size=8")
 TINY = [word for field in (*SIZES, "network.net_arch=[8]") for word in ("--set", field)]
