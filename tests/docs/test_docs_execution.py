@@ -49,7 +49,9 @@ NOT_EXECUTED: Mapping[str, str] = {
     r"record .*--set env.control_mode=.*|record offline_rl .*": (
         "joints, which the fake simulator has not; tests/data/test_record_maniskill.py"
     ),
-    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/memory/.*": "trained agents; tests/agents/test_agents_as_policies.py",
+    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/memory/.*": (
+        "trained agents; tests/agents/test_agents_as_policies.py"
+    ),
     r"serve --policy pi05 .*": "fetched weights and a GPU; tests/cli/test_serve.py",
 }
 """Command -> what it needs that is not here, and which tests run the like."""
