@@ -2,6 +2,7 @@
 
 import argparse
 import shutil
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,7 @@ NEEDED: dict[tuple[str, ...], str] = {
     ("dataset", "push"): "recorded nobody/nothing",
     ("dataset", "pull"): "nobody/nothing new",
     ("finetune",): "--policy act --dataset recorded --allow-unreplayed",
+    ("train-agent",): f"--algorithm ppo --task {TASK}",
     ("checkpoint", "verify"): "nothing",
     ("checkpoint", "fetch"): "smolvla_base --out new",
     ("checkpoint", "rehearse"): "nothing",
@@ -77,6 +79,8 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         (vla_eval.doctor, "run_probe"),
     ):
         monkeypatch.setattr(module, name, refuse)
+    if find_spec("stable_baselines3") is not None:
+        monkeypatch.setattr("vla_eval.agents.train.train_agent", refuse)
 
 
 def outcome(case: Case, capsys: pytest.CaptureFixture[str]) -> str | None:
