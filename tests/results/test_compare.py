@@ -23,6 +23,7 @@ from vla_eval.results.sweep import (
     episodes_to_settle,
 )
 from vla_eval.results.sweep_format import render_sweep
+from vla_eval.workers.in_process import IN_PROCESS
 
 TASK = "RememberColor3-v0"
 
@@ -165,7 +166,7 @@ def test_the_verb_prints_the_table_of_a_run(tmp_path: Path, capsys: pytest.Captu
         simulator="fake",
         workers=1,
     )
-    evaluate(config, out=tmp_path / "run")
+    evaluate(config, out=tmp_path / "run", backend=IN_PROCESS)
     assert main(["compare", str(tmp_path / "run")]) == 0
     out = capsys.readouterr().out
     assert out.count("| oracle ") == 2 and "cue frames" in out
