@@ -3,18 +3,15 @@
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
-from vla_eval.config.agents import LOGGERS, AgentConfig, AgentRecipe
-from vla_eval.config.files import Recipe, digest_of, to_data
-from vla_eval.config.finetuning import merge_fields
-from vla_eval.config.policy import load_policy
+from vla_eval.config.agents import AgentConfig, AgentRecipe
+from vla_eval.config.files import Recipe, digest_of
+from vla_eval.config.policy import changed_section, load_policy
 from vla_eval.errors import RecipeError
 from vla_eval.policies.agents.algorithms import Algorithm, algorithm, steps_per_update
-from vla_eval.strict.decoding import decode
 from vla_eval.tasks.arguments import check_arguments
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.training.request import FinetuneSummary
+from vla_eval.training.request import FinetuneSummary, compared_fields
 from vla_eval.training.run_folder import REQUEST_KEY, newest_step, read_record
 
 
@@ -26,9 +23,7 @@ def load_agent_recipe(config: AgentConfig) -> Recipe[AgentRecipe]:
             f"policies/{recipe.name}.yaml has no section `train_agent`: it is not trained by rewards. "
             f"`mikasa-vla list policies` shows the recipes; `finetune` trains on demonstrations."
         )
-    data = merge_fields(to_data(recipe.value.train_agent), config.train_agent)
-    value = decode(AgentRecipe, data, where=f"policies/{recipe.name}.yaml, train_agent")
-    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
+    return changed_section(recipe, "train_agent", AgentRecipe, config.train_agent)
 
 
 def look_for(config: AgentConfig) -> FinetuneSummary | None:
@@ -57,11 +52,6 @@ def run_folder_of(config: AgentConfig) -> Path:
         return Path(config.out)
     name = task_spec(config.task).id.replace("/", "-")
     return Path("runs") / f"{Path(config.policy).stem}-{name}-{config.run_seed}"
-
-
-def compared_fields(recipe: AgentRecipe) -> dict[str, Any]:  # Any: plain data
-    """Return the recipe's fields that weights may depend on."""
-    return {name: value for name, value in to_data(recipe).items() if name not in LOGGERS}
 
 
 def request_sha256(recipe: AgentRecipe, task: str, *, run_seed: int) -> str:

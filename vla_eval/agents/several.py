@@ -48,6 +48,18 @@ def of_shard(configs: Sequence[AgentConfig], shard: Shard | None) -> list[AgentC
 
 def evaluation(configs: Sequence[AgentConfig]) -> EvalConfig:
     """Return the evaluation of the trainings beside their controls: a run per run seed."""
+    return decode(EvalConfig, _evaluation(configs), where="trainings")
+
+
+def write_evaluation(configs: Sequence[AgentConfig], out: Path) -> Path:
+    """Write the evaluation as a configuration, and return the file."""
+    file = out / EVALUATION_FILE
+    replace_file(file, yaml.safe_dump(_evaluation(configs), sort_keys=False, allow_unicode=True))
+    return file
+
+
+def _evaluation(configs: Sequence[AgentConfig]) -> dict[str, Any]:  # Any: plain data of YAML
+    """Return it as a person would write it: defaults are left out."""
     recipes = [load_agent_recipe(one).value for one in configs]
     tasks = list(dict.fromkeys(task_spec(one.task).id for one in configs))
     kinds = {task_spec(task).is_base for task in tasks}
@@ -67,28 +79,12 @@ def evaluation(configs: Sequence[AgentConfig]) -> EvalConfig:
         name = Path(one.policy).stem.removesuffix("_base")
         runs.setdefault((name, task_spec(one.task).id), []).append(str(one.out))
     policies = [f"{name}:{task}={','.join(folders)}" for (name, task), folders in runs.items()]
-    data: dict[str, Any] = {
+    simulator = recipes[0].simulator
+    return {
         "name": "agents",
         "tasks": tasks,
         "policies": [*policies, *CONTROLS[True in kinds]],
         "episodes": EPISODES,
-        "env": env,
-        "simulator": recipes[0].simulator,
+        **({"env": dict(env)} if env else {}),
+        **({} if simulator == "maniskill" else {"simulator": simulator}),
     }
-    return decode(EvalConfig, {key: value for key, value in data.items() if value != {}}, where="trainings")
-
-
-def write_evaluation(configs: Sequence[AgentConfig], out: Path) -> Path:
-    """Write the evaluation as a configuration, and return the file."""
-    config = evaluation(configs)
-    data = {
-        "name": config.name,
-        "tasks": list(config.tasks),
-        "policies": list(config.policies),
-        "episodes": config.episodes,
-        **({"env": dict(config.env)} if config.env else {}),
-        **({} if config.simulator == "maniskill" else {"simulator": config.simulator}),
-    }
-    file = out / EVALUATION_FILE
-    replace_file(file, yaml.safe_dump(data, sort_keys=False, allow_unicode=True))
-    return file

@@ -21,7 +21,7 @@ from vla_eval.agents.checkpoints import load_checkpoint, write_checkpoint
 from vla_eval.agents.curve import draw_curve
 from vla_eval.agents.job import AgentJob, agent_job
 from vla_eval.agents.progress import Progress, quiet_logger
-from vla_eval.agents.request import compared_fields, request_sha256
+from vla_eval.agents.request import request_sha256
 from vla_eval.agents.simulators import LOGS_FOLDER, simulators
 from vla_eval.agents.vector_env import SlotsEnv
 from vla_eval.config.agents import AgentConfig
@@ -32,7 +32,7 @@ from vla_eval.seeding import global_generators_kept, seed_global_generators
 from vla_eval.storage.provenance import collect_environment, package_version
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.held_out import HeldOut
-from vla_eval.training.request import FinetuneSummary
+from vla_eval.training.request import FinetuneSummary, compared_fields
 from vla_eval.training.run_folder import (
     LOCK_FILE,
     REQUEST_KEY,

@@ -141,20 +141,10 @@ def finetune_with_progress(
         return finished, None
     check_writable(run_folder_of(config))
     # Here and not above: what is finished need not wait for torch.
-    from tqdm import tqdm
-
-    from vla_eval.cli.terminal.progress import ANSWER_TO_STOP, stop_on_signals
+    from vla_eval.cli.terminal.progress import ANSWER_TO_STOP, train_with_progress
     from vla_eval.training.finetune import finetune
 
-    # Some of lerobot's policies print while they are made.
-    with stop_on_signals(ANSWER_TO_STOP) as stop, contextlib.redirect_stdout(sys.stderr):
-        summary = finetune(
-            config,
-            command=command,
-            say=lambda line: tqdm.write(line, file=sys.stderr),
-            is_stopping=lambda: stop.is_asked,
-        )
-    return summary, None if summary.is_finished else stop
+    return train_with_progress(finetune, config, command=command, answer=ANSWER_TO_STOP)
 
 
 def _done(summary: "FinetuneSummary") -> int:

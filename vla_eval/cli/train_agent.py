@@ -162,19 +162,10 @@ def _train(config: AgentConfig, *, command: str) -> "tuple[FinetuneSummary, Stop
         return finished, None
     check_writable(run_folder_of(config))
     # Here and not above: what is finished need not wait for torch.
-    from tqdm import tqdm
-
     from vla_eval.agents.train import train_agent
-    from vla_eval.cli.terminal.progress import stop_on_signals
+    from vla_eval.cli.terminal.progress import train_with_progress
 
-    with stop_on_signals(ANSWER_TO_STOP) as stop, contextlib.redirect_stdout(sys.stderr):
-        summary = train_agent(
-            config,
-            command=command,
-            say=lambda line: tqdm.write(line, file=sys.stderr),
-            is_stopping=lambda: stop.is_asked,
-        )
-    return summary, None if summary.is_finished else stop
+    return train_with_progress(train_agent, config, command=command, answer=ANSWER_TO_STOP)
 
 
 def _configs(args: argparse.Namespace) -> list[AgentConfig]:

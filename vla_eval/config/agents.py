@@ -14,8 +14,6 @@ Rewards = Literal["dense", "sparse"]
 
 TRAINING_SEEDS = range(1_000_000, 2**31)
 """Of trainings' episodes. Tables are made from 1 to 100; checkpoints are evaluated on 900,000 and above."""
-LOGGERS = ("tensorboard",)
-"""Fields that may be changed when a training is resumed: no weight depends on them."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -4,6 +4,7 @@ Some names of former recipes are rows of `configs/ablations.yaml` now; they stil
 """
 
 import functools
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -63,6 +64,15 @@ def load_policy(name: str) -> Recipe[PolicyRecipe]:
         finetune=decode(FinetuneRecipe, section, where=f"configs/{ABLATIONS}.yaml, {stem}"),
     )
     return replace(base, name=stem, value=value)
+
+
+def changed_section[T](
+    recipe: Recipe[PolicyRecipe], name: str, cls: type[T], changes: Mapping[str, Any]
+) -> Recipe[T]:
+    """Return a section of a recipe, which has it, with values on top."""
+    data = merge_fields(to_data(getattr(recipe.value, name)), changes)
+    value = decode(cls, data, where=f"policies/{recipe.name}.yaml, {name}")
+    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
 
 
 @functools.cache

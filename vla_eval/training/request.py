@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from vla_eval.checkpoints.files import checkpoint_sha256, file_sha256, find_checkpoint
+from vla_eval.config.agents import AgentRecipe
 from vla_eval.config.files import Recipe, digest_of, list_recipes, to_data
-from vla_eval.config.finetuning import LOGGERS, FinetuneConfig, FinetuneRecipe, merge_fields
-from vla_eval.config.policy import load_policy
+from vla_eval.config.finetuning import LOGGERS, FinetuneConfig, FinetuneRecipe
+from vla_eval.config.policy import changed_section, load_policy
 from vla_eval.data.dataset_folder import require_finished
 from vla_eval.data.facts import KINDS
 from vla_eval.data.info_file import one_dataset
 from vla_eval.errors import CheckpointError, RecipeError
-from vla_eval.strict.decoding import decode
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.training.held_out import HeldOut
 from vla_eval.training.run_folder import REQUEST_KEY, newest_step, read_metrics, read_record
@@ -52,9 +52,7 @@ def load_finetune_recipe(config: FinetuneConfig) -> Recipe[FinetuneRecipe]:
             f"policies/{recipe.name}.yaml has no section `finetune`: {instead}. "
             f"`mikasa-vla list policies` shows the recipes."
         )
-    data = merge_fields(to_data(recipe.value.finetune), config.finetune)
-    value = decode(FinetuneRecipe, data, where=f"policies/{recipe.name}.yaml, finetune")
-    return Recipe(name=recipe.name, path=recipe.path, sha256=recipe.sha256, value=value)
+    return changed_section(recipe, "finetune", FinetuneRecipe, config.finetune)
 
 
 def _no_recipe(folder: Path) -> str:
@@ -99,7 +97,7 @@ def run_folder_of(config: FinetuneConfig) -> Path:
     )
 
 
-def compared_fields(recipe: FinetuneRecipe) -> dict[str, Any]:  # Any: plain data
+def compared_fields(recipe: FinetuneRecipe | AgentRecipe) -> dict[str, Any]:  # Any: plain data
     """Return the recipe's fields that weights may depend on."""
     return {name: value for name, value in to_data(recipe).items() if name not in LOGGERS}
 

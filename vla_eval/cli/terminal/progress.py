@@ -5,8 +5,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
@@ -25,6 +25,7 @@ from vla_eval.workers.load import Load
 
 if TYPE_CHECKING:  # of the recorder, which takes longer to import
     from vla_eval.data.recording.record import Phase
+    from vla_eval.training.request import FinetuneSummary
 
 STOP_SIGNALS = ("SIGINT", "SIGTERM", "SIGHUP")
 STDERR = 2
@@ -75,6 +76,21 @@ def stop_on_signals(answer: str = "") -> Iterator[StopRequest]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def train_with_progress[C](
+    train: "Callable[..., FinetuneSummary]", config: C, *, command: str, answer: str
+) -> "tuple[FinetuneSummary, StopRequest | None]":
+    """Train, or resume it, with lines on standard error; the request if a signal has stopped it."""
+    # Libraries' policies print while they are made.
+    with stop_on_signals(answer) as stop, redirect_stdout(sys.stderr):
+        summary = train(
+            config,
+            command=command,
+            say=lambda line: tqdm.write(line, file=sys.stderr),
+            is_stopping=lambda: stop.is_asked,
+        )
+    return summary, None if summary.is_finished else stop
 
 
 def evaluate_with_progress(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any  # stable-baselines3's classes, and values of a recipe
 
 from vla_eval.errors import MissingDependencyError, RecipeError, VlaEvalError, check_names
+from vla_eval.strict.json_text import WORDS
 
 INSTALL = "Install it with `make rl`, or pip install 'mikasa-vla-eval[rl]'."
 
@@ -22,7 +23,6 @@ class Algorithm:
     recipes: Mapping[str, str]  # "robot", "base" -> the recipe that is meant without --policy
     steps: str  # the argument that says after how many steps per environment weights change
     extras: tuple[str, ...] = ()  # further fields of the network that a recipe may set
-    has_memory: bool = False
     fits_discrete: bool = True  # it can choose among discrete actions
     replays: bool = False  # it learns from a buffer of earlier steps
 
@@ -42,7 +42,6 @@ _ROWS = (
         recipes={"robot": "ppo_lstm", "base": "ppo_lstm_base"},
         steps="n_steps",
         extras=("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm", "lstm_forget_bias"),
-        has_memory=True,
     ),
     Algorithm(
         name="sac",
@@ -118,17 +117,8 @@ def check_arguments(row: Algorithm, arguments: Mapping[str, Any]) -> None:
     for name, value in arguments.items():
         kinds = _kinds(parameters[name].default)
         if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
-            words = " or ".join(_WORDS[kind] for kind in kinds)
+            words = " or ".join(WORDS[kind] for kind in kinds)
             raise RecipeError(f"train_agent.arguments.{name} is {value!r}, expected {words}.")
-
-
-_WORDS: Mapping[type, str] = {
-    bool: "true or false",
-    int: "a whole number",
-    float: "a number",
-    str: "a word",
-    type(None): "null",
-}
 
 
 def _kinds(default: object) -> tuple[type, ...]:

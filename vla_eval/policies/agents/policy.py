@@ -60,8 +60,8 @@ class AgentPolicy:
     def _check_shapes(self, found: dict[str, tuple[int, ...]]) -> None:
         expected = self._about.shapes
         if found != expected:
-            line = f"  inputs: expected {expected} (trained on {self._about.task}), found {found}. "
-            refuse_differences([line.strip()], policy=self.spec.name, task=self._task)
+            line = f"inputs: expected {expected} (trained on {self._about.task}), found {found}."
+            refuse_differences([line], policy=self.spec.name, task=self._task)
 
 
 def make_agent(context: PolicyContext, *, checkpoint: str | None = None) -> AgentPolicy:
