@@ -267,11 +267,11 @@ class TestOutcome:
         assert run(Fixed(ActionChunk(actions=chunk)), n_action_steps=2).n_clipped_steps == HORIZON // 2
 
     def test_before_the_first_chunk_arrives_the_arm_holds(self) -> None:
-        policy = Fixed(ActionChunk(actions=np.full((4, 7), 0.5, dtype=np.float32)), chunk_size=4)
+        policy = Fixed(ActionChunk(actions=np.full((6, 7), 0.5, dtype=np.float32)), chunk_size=6)
         env = env_for(policy)
-        chunking = ChunkingSpec(n_action_steps=1, delay_steps=3)
+        chunking = ChunkingSpec(n_action_steps=1, delay=3)
 
-        rollout(env, policy, [start()], RolloutSettings(chunking=chunking))
+        (record,) = rollout(env, policy, [start()], RolloutSettings(chunking=chunking))
 
         # Three steps of holding, then 57 steps of 0.5 * 0.039 m upwards from 0.318 m.
         assert env.reset({1: 1}, render=False)[1].observation.state["tcp_pose"][2] == pytest.approx(0.318)
@@ -279,6 +279,9 @@ class TestOutcome:
             "tcp_pose"
         ][2]
         assert height == pytest.approx(0.318 + 57 * 0.5 * 0.039, abs=1e-5)
+        # Inferences at 0, 3, … 57; each chunk is executed from 3 to 5 steps after its observation.
+        assert (record.n_held_steps, record.n_inferences, record.mean_age_steps) == (3, 20, 4.0)
+        assert record.delay_steps is None
 
 
 class TestRefusals:

@@ -47,6 +47,15 @@ class Observation:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class CommittedActions:
+    """What is left of the chunk under way when a policy infers: the new chunk has to join it."""
+
+    actions: FloatArray  # (N, A) float32; row i is meant for step `window.last.step + i`; N may be 0
+    # the first so many are expected to be executed before the new chunk can arrive; it may change the others
+    n_frozen: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ObservationWindow:
     """The observations since the previous inference of one episode, oldest first, never empty.
 
@@ -55,6 +64,7 @@ class ObservationWindow:
 
     slot: int
     frames: tuple[Observation, ...]
+    committed: CommittedActions | None = None  # None unless the policy reads it and the mode tells it
 
     @property
     def last(self) -> Observation:

@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from vla_eval.chunking import ChunkingSpec
+from vla_eval.chunking import ChunkingSpec, Executed
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
 from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError, SpecMismatchError
+from vla_eval.motion import HELD, motion_of
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import ActionSpec, EnvSpec, PolicySpec
 from vla_eval.task_state import TaskStatus
 
-TCP_POSE = "tcp_pose"  # the state whose first three numbers are the tool centre point, m
+TCP_POSE = "tcp_pose"  # the state that is the pose of the tool centre point: m, then a wxyz quaternion
 
 
 @dataclass(slots=True, kw_only=True)
@@ -24,9 +24,10 @@ class EpisodeLog:
 
     start: EpisodeStart  # the episode
     status: TaskStatus  # what the task said last
-    # where the tool centre point began; None if its pose is not a state of the environment
-    tcp_start_m: NDArray[np.float64] | None
-    tcp_reach_m: float | None = None  # how far it ever was from there
+    # the poses of the tool centre point; none if that is not a state of the environment
+    tcp_poses: list[FloatArray]
+    # of each control step, the step of the observation behind its action, or `HELD`
+    inferred_at_steps: list[int] = field(default_factory=list)
     n_steps: int = 0  # control steps executed
     success_step: int | None = None  # control steps executed when the success rule first held
     episode_return: float = 0.0
@@ -39,7 +40,7 @@ class EpisodeLog:
     @classmethod
     def begin(cls, start: EpisodeStart, reset: StepResult) -> Self:
         """Start the log of an episode from its reset result."""
-        log = cls(start=start, status=reset.status, tcp_start_m=_tcp_m(reset))
+        log = cls(start=start, status=reset.status, tcp_poses=_tcp_pose(reset))
         log._digest_state(reset)
         return log
 
@@ -49,15 +50,15 @@ class EpisodeLog:
         self.last_inference_step = self.n_steps
         self.n_frames += n_frames
 
-    def note_step(self, action: FloatArray, result: StepResult, action_spec: ActionSpec) -> None:
-        """Account for one control step by the action (A,) asked for and its result."""
+    def note_step(
+        self, executed: Executed | None, action: FloatArray, result: StepResult, action_spec: ActionSpec
+    ) -> None:
+        """Account for one control step by the action (A,) asked for, where it is from, and its result."""
         self.n_steps += 1
         self._check_finite(result)
         self.status = result.status
-        position_m = _tcp_m(result)
-        if position_m is not None and self.tcp_start_m is not None:
-            distance_m = float(np.linalg.norm(position_m - self.tcp_start_m))
-            self.tcp_reach_m = max(self.tcp_reach_m or 0.0, distance_m)
+        self.tcp_poses += _tcp_pose(result)
+        self.inferred_at_steps.append(HELD if executed is None else executed.inferred_at_step)
         self.episode_return += result.reward
         bounds = zip(action.tolist(), action_spec.low, action_spec.high, strict=True)
         self.n_clipped_steps += not all(low <= number <= high for number, low, high in bounds)
@@ -75,9 +76,21 @@ class EpisodeLog:
         )
         return is_won or self.status.fail or self.status.is_over or self.n_steps >= self.start.horizon_steps
 
-    def record(self, policy: str, n_action_steps: int, *, stops_at_success: bool) -> EpisodeRecord:
-        """Return the record of the finished episode; one that stops at its first success has no known end."""
+    def record(
+        self,
+        policy: str,
+        n_action_steps: int,
+        *,
+        stops_at_success: bool,
+        delay_steps: Sequence[int] | None,
+        control_hz: float,
+    ) -> EpisodeRecord:
+        """Return the record of the finished episode; one that stops at its first success has no known end.
+
+        `delay_steps`: of each inference, where that differs.
+        """
         status, succeeded = self.status, self.success_step is not None
+        ages = [step - at for step, at in enumerate(self.inferred_at_steps) if at != HELD]
         has_candidates = status.n_candidates > 0
         has_end = status.has_success and not (stops_at_success and succeeded)
         return EpisodeRecord(
@@ -106,12 +119,26 @@ class EpisodeLog:
             trajectory_sha256=self.digest.hexdigest(),
             target_place=_place(status, status.target),
             first_choice_place=_place(status, status.first_choice),
-            tcp_reach_m=self.tcp_reach_m,
+            tcp_reach_m=self._tcp_reach_m,
             right_candidates=status.right_candidates if has_candidates else None,
             touched_candidates=status.touched_candidates if has_candidates else None,
             candidate_places=status.candidate_places or None,
             final_turn_rad=status.turned_rad,
+            n_held_steps=self.inferred_at_steps.count(HELD),
+            mean_age_steps=sum(ages) / len(ages) if ages else None,
+            delay_steps=None if delay_steps is None else tuple(delay_steps),
+            motion=motion_of(self.tcp_poses, self.inferred_at_steps, control_hz=control_hz)
+            if self.tcp_poses
+            else None,
         )
+
+    @property
+    def _tcp_reach_m(self) -> float | None:
+        """How far the tool centre point ever was from where it began, straight."""
+        if not self.tcp_poses:
+            return None
+        start_m, *path_m = (pose[:3].astype(np.float64) for pose in self.tcp_poses)
+        return max((float(np.linalg.norm(one - start_m)) for one in path_m), default=None)
 
     def _check_finite(self, result: StepResult) -> None:
         values = {"reward": np.array(result.reward), **result.observation.state}
@@ -126,6 +153,16 @@ class EpisodeLog:
         state = result.observation.state
         for name in sorted(state):
             self.digest.update(np.ascontiguousarray(state[name], dtype="<f4").tobytes())
+
+
+def check_execution(spec: PolicySpec, chunking: ChunkingSpec) -> None:
+    """Raise `SpecMismatchError` unless the policy's chunks can be executed as asked for."""
+    chunking.check_chunk_size(spec.chunk_size, policy=spec.name)
+    if chunking.execution.commits and not spec.reads_committed:
+        raise SpecMismatchError(
+            f"policy '{spec.name}' does not read what is committed, which chunking.mode={chunking.mode} "
+            "tells it. Use another mode, or a policy that joins its chunks (docs/real_time.md)."
+        )
 
 
 def check_start(episode: EpisodeStart, chunking: ChunkingSpec, env: EnvSpec) -> None:
@@ -171,9 +208,9 @@ def chunk_problem(chunk: object, *, chunk_size: int, dims: Sequence[str]) -> str
     )
 
 
-def _tcp_m(result: StepResult) -> NDArray[np.float64] | None:
+def _tcp_pose(result: StepResult) -> list[FloatArray]:
     pose = result.observation.state.get(TCP_POSE)
-    return None if pose is None else pose[:3].astype(np.float64)
+    return [] if pose is None else [pose.copy()]
 
 
 def _place(status: TaskStatus, candidate: int | None) -> int | None:

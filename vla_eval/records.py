@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any, Literal, NamedTuple, Self
 
 from vla_eval.errors import RunFolderError
+from vla_eval.motion import Motion
 from vla_eval.strict.bounds import Count, Distance, Positive, Rate, Seconds
 from vla_eval.strict.json_text import Source, as_dataclass, read_json, read_version
 
@@ -23,6 +24,7 @@ LATER_FIELDS = frozenset(
     {
         *("chance_success", "target_place", "first_choice_place", "tcp_reach_m"),
         *("right_candidates", "touched_candidates", "candidate_places", "final_turn_rad"),
+        *("n_held_steps", "mean_age_steps", "delay_steps", "motion"),
     }
 )
 """Fields that records of earlier versions of this program do not have."""
@@ -88,6 +90,12 @@ class EpisodeRecord:
         episode_return: sum of rewards.
         n_inferences: calls of the policy; n_frames: observations given to it.
         n_clipped_steps: steps whose action went beyond the action space and was clipped.
+        n_held_steps: steps at which no chunk had an action and the arm held still, the wait for the first
+            chunk included.
+        mean_age_steps: how old the observation behind an executed action was, mean over the steps that were
+            not held.
+        delay_steps: control steps that each inference took, where they differ.
+        motion: how smooth the arm's way was; None without the pose of a tool centre point.
         trajectory_sha256: digest of all executed actions and states: equal digests, equal episodes.
         error: the cause, for an error only.
     """
@@ -120,6 +128,10 @@ class EpisodeRecord:
     touched_candidates: tuple[Count, ...] | None = None
     candidate_places: tuple[Count, ...] | None = None
     final_turn_rad: float | None = None
+    n_held_steps: Count | None = None
+    mean_age_steps: Distance | None = None
+    delay_steps: tuple[Count, ...] | None = None
+    motion: Motion | None = None
     error: EpisodeError | None = None
 
     @property
@@ -295,6 +307,13 @@ OF_A_RESULT = (
     _not_more("success_step", "n_steps"),
     _not_more("n_inferences", "n_steps"),
     _not_more("n_clipped_steps", "n_steps"),
+    _not_more("n_held_steps", "n_steps"),
+    _not_more("mean_age_steps", "n_steps"),
+    Rule(
+        ("n_inferences", "delay_steps"),
+        "one delay per inference",
+        lambda one: one.delay_steps is None or len(one.delay_steps) == one.n_inferences,
+    ),
     _not_more("target", "n_candidates", less=True),
     _not_more("first_choice", "n_candidates", less=True),
     _not_more("n_wrong_choices", "n_candidates"),

@@ -5,8 +5,9 @@ chooses the action; the environment executes it, and renders only if somebody wi
 counted and recorded on the way is in `episode_log.py`.
 """
 
+import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
@@ -14,6 +15,7 @@ from vla_eval.core import (
     BatchPolicy,
     EpisodeStart,
     FloatArray,
+    ObservationWindow,
     Policy,
     SimEnv,
     Stage,
@@ -21,7 +23,8 @@ from vla_eval.core import (
     StepResult,
 )
 from vla_eval.cue_view import AS_SHOWN, CueBoxes, CueView, CueViewSettings, cue_locator
-from vla_eval.episode_log import EpisodeLog, check_chunk, check_start
+from vla_eval.episode_log import EpisodeLog, check_chunk, check_execution, check_start
+from vla_eval.latency import DelayTrace, EpisodeDelays
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import check_compatible
 
@@ -41,6 +44,7 @@ class RolloutSettings:
     reset_policy_at_step: int | None = None
     # what the policy is given to see of the cue; observers get what was rendered
     cue_view: CueViewSettings = AS_SHOWN
+    delay_trace: DelayTrace | None = None  # the delays to play, where `chunking.delay` names a run
 
 
 class _Running(NamedTuple):
@@ -78,7 +82,7 @@ def rollout(
         SimulationError: the simulator returned a reward or a state that is not finite.
     """
     check_compatible(policy.spec, env.spec)
-    settings.chunking.check_chunk_size(policy.spec.chunk_size, policy=policy.spec.name)
+    check_execution(policy.spec, settings.chunking)
     for episode in episodes:
         check_start(episode, settings.chunking, env.spec)
     boxes = cue_locator(env, settings.cue_view, policy.spec.cameras)
@@ -92,8 +96,7 @@ def rollout(
         loop.step(active)
         after = settings.steps_after_success if stop else None
         active = [episode for episode in active if not episode.log.is_over(steps_after_success=after)]
-    n_action_steps = settings.chunking.n_action_steps
-    return [one.log.record(policy.spec.name, n_action_steps, stops_at_success=stop) for one in running]
+    return [loop.record(one) for one in running]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,7 +125,28 @@ class _Loop:
         view = CueView(settings=self.settings.cue_view, locate=lambda: self.cue_boxes(start.slot))
         view.note(result)
         log = EpisodeLog.begin(start, result)
-        return _Running(log=log, view=view, executor=ChunkExecutor(self.settings.chunking))
+        return _Running(
+            log=log, view=view, executor=ChunkExecutor(self.settings.chunking, self._delays(start))
+        )
+
+    def _delays(self, start: EpisodeStart) -> EpisodeDelays:
+        return EpisodeDelays(
+            delay=self.settings.chunking.delay,
+            seed=start.seed,
+            run=start.run,
+            control_hz=self.env.spec.control_hz,
+            trace=self.settings.delay_trace,
+        )
+
+    def record(self, episode: _Running) -> EpisodeRecord:
+        chunking = self.settings.chunking
+        return episode.log.record(
+            self.policy.spec.name,
+            chunking.n_action_steps,
+            stops_at_success=self.settings.stop_at_success,
+            delay_steps=None if isinstance(chunking.delay, int) else episode.executor.delays.steps,
+            control_hz=self.env.spec.control_hz,
+        )
 
     def infer(self, active: Sequence[_Running]) -> None:
         """Ask the policy for a chunk for each episode that is due."""
@@ -134,30 +158,41 @@ class _Loop:
             if first_step is not None and episode.log.last_inference_step < first_step <= episode.log.n_steps:
                 self.policy.reset([episode.log.start])
                 episode.view.forget_before(first_step)
-        windows = [episode.view.take(episode.log.start.slot, self.policy.spec) for episode in due]
+        windows = [self._window(episode) for episode in due]
         self.heartbeat("inference")
+        began = time.perf_counter()
         if isinstance(self.policy, BatchPolicy):
             chunks = self.policy.act_batch(windows)
         else:
             chunks = [self.policy.act(window) for window in windows]
+        seconds = time.perf_counter() - began
         for episode, window, chunk in zip(due, windows, chunks, strict=True):
             check_chunk(chunk, self.policy.spec, self.env.spec.action, episode.log)
-            episode.executor.submit(episode.log.n_steps, chunk)
+            episode.executor.submit(episode.log.n_steps, chunk, seconds=seconds)
             episode.log.note_inference(n_frames=len(window.frames))
             for observer in self.observers:
                 observer.on_inference(episode.log.start, episode.log.n_steps, chunk)
 
+    def _window(self, episode: _Running) -> ObservationWindow:
+        spec = self.policy.spec
+        window = episode.view.take(episode.log.start.slot, spec)
+        if not spec.reads_committed:
+            return window
+        n_dims = len(self.env.spec.action.dims)
+        return replace(window, committed=episode.executor.committed(episode.log.n_steps, n_dims=n_dims))
+
     def step(self, active: Sequence[_Running]) -> None:
-        actions: dict[int, FloatArray] = {}
-        for episode in active:
-            action, slot = episode.executor.action(episode.log.n_steps), episode.log.start.slot
-            actions[slot] = self.env.hold_action(slot) if action is None else action
+        executed = {e.log.start.slot: e.executor.action(e.log.n_steps) for e in active}
+        actions: dict[int, FloatArray] = {
+            slot: self.env.hold_action(slot) if one is None else one.action for slot, one in executed.items()
+        }
         render = frozenset(episode.log.start.slot for episode in active if self._renders_next(episode))
         self.heartbeat("step")
         results = self.env.step(actions, render=render)
         for episode in active:
-            action, result = actions[episode.log.start.slot], results[episode.log.start.slot]
-            episode.log.note_step(action, result, self.env.spec.action)
+            slot = episode.log.start.slot
+            action, result = actions[slot], results[slot]
+            episode.log.note_step(executed[slot], action, result, self.env.spec.action)
             episode.view.note(result)
             for observer in self.observers:
                 observer.on_step(episode.log.start, action, result)

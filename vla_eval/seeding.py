@@ -30,6 +30,7 @@ class Stream(IntEnum):
     DISTRACTOR = 9
     SHUFFLE = 10
     AGENT = 11
+    DELAY = 12
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

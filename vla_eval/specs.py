@@ -73,6 +73,7 @@ class PolicySpec:
     states: tuple[str, ...]  # the proprioceptive vectors it needs
     chunk_size: int  # how many actions one inference gives
     privileged: bool = False  # whether it reads the true state of the world (scripted controls only)
+    reads_committed: bool = False  # whether its chunks join `ObservationWindow.committed`
 
     def is_given(self, step: int, next_inference_step: int, *, horizon_steps: int) -> bool:
         """Whether the policy will be given the observation at `step`: nothing after the last inference is."""

@@ -29,7 +29,7 @@ SLIPS = {
     f"{EVAL} --format tex": "Did you mean 'latex'?",
     f"{EVAL} --format md": "Did you mean 'markdown'?",
     f"{EVAL} --n-action-steps 1,x": "expected whole numbers such as 1 4 8",
-    f"{EVAL} --set delay_steps=20": "Did you mean 'env.delay_steps' or 'chunking.delay_steps'?",
+    f"{EVAL} --set delay_steps=20": "Did you mean 'env.delay_steps'?",
     f"{EVAL} --set cue_steps=20": "Did you mean 'env.cue_steps'?",
     f"{EVAL} --set horizon_steps=90": "Did you mean 'env.horizon_steps'?",
     f"{EVAL} --set backend=gpu": "Did you mean 'render.backend'?",

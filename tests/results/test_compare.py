@@ -13,6 +13,7 @@ from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import load_recipe
 from vla_eval.errors import ReportError, UnknownNameError
+from vla_eval.latency import EpisodeDelays
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowKey
 from vla_eval.results.sweep import (
@@ -82,7 +83,8 @@ def test_policies_are_compared_at_the_same_k_and_p_is_corrected_for_all() -> Non
 @pytest.mark.parametrize(("k", "seen"), [(1, "5"), (2, "3"), (4, "2"), (5, "1"), (8, "1")])
 def test_a_policy_that_reads_the_last_frame_sees_the_cue_when_it_infers(k: int, seen: str) -> None:
     # 5 steps of cue: steps 0 … 4; by the executor itself, steps at which an inference is due.
-    executor = ChunkExecutor(ChunkingSpec(n_action_steps=k))
+    spec = ChunkingSpec(n_action_steps=k)
+    executor = ChunkExecutor(spec, EpisodeDelays(delay=0, seed=1, control_hz=20.0))
     looked = 0
     for step in range(5):
         if step == executor.next_inference_step:

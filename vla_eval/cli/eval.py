@@ -53,6 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "or a flag sets others, and its summary figure below the table",
     )
     _add_run_arguments(parser)
+    parser.add_argument(
+        "--delay-trace", metavar="RUN", help="play the inference delays of another run (chunking.delay.trace)"
+    )
     parser.add_argument("--suite", metavar="NAME", help="all tasks of a suite: `mikasa_base` …")
     for kind, what in (("video", "an mp4"), ("rrd", "a file for the rerun viewer")):
         parser.add_argument(
@@ -213,6 +216,8 @@ def _config(args: argparse.Namespace) -> EvalConfig:
             data["tasks"] = _tasks_of(args)
         if args.serve:
             data["inference"] = "shared"
+        if args.delay_trace is not None:
+            set_field(EvalConfig, data, "chunking.delay", {"trace": args.delay_trace}, where="--delay-trace")
         for kind in ("video", "rrd"):
             which = getattr(args, f"capture_{kind}")
             if which is not None:

@@ -163,7 +163,7 @@ def apply_overrides(
         path, equals, text = override.partition("=")
         where = f"--set {override:.{MAX_SHOWN}}"
         if not equals or not all(path.split(".")):
-            raise RecipeError(f"{where}: expected FIELD=VALUE, for example --set chunking.delay_steps=2.")
+            raise RecipeError(f"{where}: expected FIELD=VALUE, for example --set chunking.delay=2.")
         set_field(cls, data, path, load_yaml(text, where=where), where=where, free=free)
 
 

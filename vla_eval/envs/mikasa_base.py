@@ -81,7 +81,7 @@ class BaseTaskSim:
         """Raise: an environment without an arm has no action that leaves it where it is."""
         raise SpecMismatchError(
             f"{self.spec.task}: no action of this environment changes nothing, so that none can take the "
-            "place of one that is late. Leave chunking.delay_steps and chunking.first_inference_step "
+            "place of one that is late. Leave chunking.delay and chunking.first_inference_step "
             "out for it."
         )
 

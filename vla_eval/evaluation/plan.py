@@ -21,6 +21,7 @@ from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
 from vla_eval.cue_view import CueViewSettings
 from vla_eval.envs.factory import describe_env
 from vla_eval.errors import RecipeError
+from vla_eval.evaluation.delay_trace import RunDelays
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.plan_checks import (
     check_base,
@@ -79,6 +80,7 @@ class Plan:
     ignored: tuple[str, ...] = ()  # what checkpoints ask for that is not done here, see `ignored_fields`
     # the part of the configuration's episodes that `jobs` are; None: all of them
     shard: Shard | None = None
+    delays: RunDelays | None = None  # those that are played
 
     @property
     def warnings(self) -> list[str]:
@@ -96,7 +98,8 @@ class Plan:
         """What could not be compared."""
         parts = dict.fromkeys(group.part for group in self._groups)
         unknown = [part for part in parts if part in self.sentences and self.sentences[part] is None]
-        return [about_nothing_known(part) for part in unknown]
+        played = [] if self.delays is None else [self.delays.note([job.key for job in self.jobs])]
+        return [*(about_nothing_known(part) for part in unknown), *played]
 
     @property
     def _groups(self) -> list[EpisodeGroup]:
@@ -117,6 +120,8 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     servers = {policy.name: policy.server for policy in policies if policy.server is not None}
     shared = resolved.shared
     groups, left_out = _groups_of_all(config, tasks, policies, prompts=prompts, shared=shared)
+    if resolved.delays is not None:
+        groups = [_with_delays(group, resolved.delays) for group in groups]
     check_chunks(config, policies)
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
@@ -125,7 +130,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     ignored = [ignored_fields(one.adapter, one.args, chunking=one.rollout.chunking) for one in groups]
     plan = Plan(
         jobs=tuple(job for group in groups for job in _jobs(config, group)),
-        recipe_hashes=_recipe_hashes(prompts, policies, servers),
+        recipe_hashes=_recipe_hashes(prompts, policies, servers) | _delays_hash(resolved.delays),
         normalization=_noted(policies, normalization_notes),
         servers={name: server.identity() for name, server in servers.items()},
         sentences=_sentences(policies, servers),
@@ -139,6 +144,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
         left_out=tuple(left_out),
         max_workers=min((limit for limit in limits if limit is not None), default=None),
         ignored=tuple(dict.fromkeys(chain.from_iterable(ignored))),
+        delays=resolved.delays,
     )
     return plan if resolved.shard is None else _shard_of(plan, config, resolved.shard)
 
@@ -207,6 +213,15 @@ def _jobs(config: EvalConfig, group: EpisodeGroup) -> Iterable[EpisodeJob]:
                 slot=index % config.slots_per_worker,
                 row=index % group.n_rows,
             )
+
+
+def _with_delays(group: EpisodeGroup, delays: RunDelays) -> EpisodeGroup:
+    trace = delays.narrowed(**group.key._asdict())
+    return replace(group, rollout=replace(group.rollout, delay_trace=trace))
+
+
+def _delays_hash(delays: RunDelays | None) -> dict[str, str]:
+    return {} if delays is None else {f"delays/{delays.path.name}": delays.sha256}
 
 
 def _noted[T](

@@ -44,10 +44,10 @@ def check_base(config: EvalConfig, task: TaskSpec) -> None:
             f"n_action_steps: {list(config.n_action_steps or ())}: {task.id}: expected 1: a "
             "policy has to see what each action brought. Leave n_action_steps out."
         )
-    if task.is_base and config.chunking.delay_steps:
+    if task.is_base and config.chunking.delay != 0:
         raise RecipeError(
-            f"chunking.delay_steps: {task.id}: no action holds still, so that none can take the place of one "
-            "that is late. Leave chunking.delay_steps out."
+            f"chunking.delay: {task.id}: no action holds still, so that none can take the place of one "
+            "that is late. Leave chunking.delay out."
         )
 
 

@@ -10,7 +10,9 @@ from vla_eval.config.environment import AS_DESIGNED
 from vla_eval.config.evaluation import OPTION_FIELDS, EvalConfig
 from vla_eval.config.files import Recipe, content_of, digest_of
 from vla_eval.config.policy import PolicyRecipe
+from vla_eval.config.recorded_chunking import recorded_chunking
 from vla_eval.errors import RecipeError, some_of
+from vla_eval.evaluation.delay_trace import RunDelays
 from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.recipe import bare_policy
 from vla_eval.storage.shard import Shard, shard_folder
@@ -32,6 +34,7 @@ class ResolvedEvaluation:
     backend: Backend
     shard: Shard | None  # the part of the episodes that is run; None: all
     named_out: Path | None  # the run folder that was asked for; None: the default one
+    delays: RunDelays | None = None  # those that `chunking.delay.trace` names
 
     @classmethod
     def of(
@@ -50,7 +53,14 @@ class ResolvedEvaluation:
             config = replace(
                 config, inference="shared" if _shares(config, policies, backend) else "in_process"
             )
-        return cls(config=config, policies=tuple(policies), backend=backend, shard=shard, named_out=out)
+        return cls(
+            config=config,
+            policies=tuple(policies),
+            backend=backend,
+            shard=shard,
+            named_out=out,
+            delays=RunDelays.of(config.chunking),
+        )
 
     @property
     def out(self) -> Path:
@@ -82,8 +92,7 @@ class ResolvedEvaluation:
             del data["compile"]
         if config.reset_policy_at_step is None:
             del data["reset_policy_at_step"]
-        if config.chunking.first_inference_step == 0:
-            del data["chunking"]["first_inference_step"]
+        data["chunking"] = recorded_chunking(config.chunking, data["chunking"])
         if config.cue_view == "as_shown":
             del data["cue_view"]
         if config.appearance == AS_DESIGNED:

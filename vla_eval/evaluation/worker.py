@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, Policy, SimEnv, StepObserver, StepResult
 from vla_eval.envs.factory import describe_device, make_env
+from vla_eval.episode_log import check_execution
 from vla_eval.errors import (
     InvalidActionError,
     RemoteConnectionError,
@@ -188,7 +189,7 @@ class EpisodeRunner:
                 self._capture.load()
             policy = make_policy(group)
             check_compatible(policy.spec, group.offered)
-            group.rollout.chunking.check_chunk_size(policy.spec.chunk_size, policy=group.key.policy)
+            check_execution(policy.spec, group.rollout.chunking)
             if isinstance(policy, CompiledPolicy):
                 compiled = policy.warm_up(group.offered, (group.instruction,))
                 if compiled is not None:

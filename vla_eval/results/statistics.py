@@ -7,13 +7,14 @@ from typing import Any
 from vla_eval.results import own_statistics as own
 from vla_eval.results.comparison import Evidence, Success
 from vla_eval.results.grouping import RowEpisodes, RowKey, Run
+from vla_eval.results.motion_statistics import SMOOTHNESS, TIMING
 from vla_eval.results.printed_table import UNDEFINED, Column
 from vla_eval.results.relative_statistics import CEILING, CHANCE, CORRECTED, NO_BASELINES, PAIRED
 from vla_eval.results.success_table import Row, Statistic
 
 STATISTICS: tuple[Statistic[Any], ...] = (  # Any: each has values of its own type
     *(own.EPISODES, own.SUCCESS, own.AT_END, own.FIRST_CHOICE, own.CHOICES, own.RETURN),
-    *(own.STEPS, own.INFERENCES),
+    *(own.STEPS, own.INFERENCES, TIMING, SMOOTHNESS),
     *(PAIRED, CHANCE, CEILING, CORRECTED),
 )
 """In the order of the columns of CSV and JSON."""

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple, get_args
 
 import scipy
 
+from vla_eval.chunking import ChunkingSettings
+from vla_eval.config.recorded_chunking import read_chunking
 from vla_eval.errors import ReportError, check_names, unknown_name
 from vla_eval.results.comparison import Comparison, Evidence, compare, gather_evidence
 from vla_eval.results.estimates import LEVEL
@@ -95,13 +97,17 @@ def compare_runs(
             f"the same seeds, for example --n-action-steps 1 4 8, or name other runs."
         )
     evidence = gather_evidence(groups, {key: (compared.get(key),) for key in groups})
-    arguments = _env_arguments(runs)
+    arguments, chunkings = _env_arguments(runs), _chunkings(runs)
     level = LEVEL / len(compared)
     rows = [
         SweepRow(
             evidence=of,
             comparison=compared.get(key),
-            cue=cue_frames(of.episodes, arguments.get((key.task, key.variant), {})),
+            cue=cue_frames(
+                of.episodes,
+                arguments.get((key.task, key.variant), {}),
+                chunkings.get((key.task, key.variant), ChunkingSettings()),
+            ),
             n_to_settle=_n_to_settle(of, evidence, difference, level),
         )
         for key, of in evidence.items()
@@ -154,12 +160,28 @@ def _env_arguments(runs: Sequence[StoredRun]) -> dict[tuple[str, str | None], Ma
     return found
 
 
-def cue_frames(group: RowEpisodes, env: Mapping[str, Any]) -> CueFrames | None:  # Any: the task's arguments
+def _chunkings(runs: Sequence[StoredRun]) -> dict[tuple[str, str | None], ChunkingSettings]:
+    """Return (task, variant) -> how chunks were executed in those runs."""
+    found: dict[tuple[str, str | None], ChunkingSettings] = {}
+    for run, labels in zip(runs, variant_labels(runs), strict=True):
+        section = run.description.config.get("chunking")
+        if isinstance(section, Mapping):
+            chunking = read_chunking(section, where=str(run.path))
+            found.update({(task, label): chunking for task, label in labels.items()})
+    return found
+
+
+def cue_frames(
+    group: RowEpisodes,
+    env: Mapping[str, Any],  # Any: the task's arguments
+    chunking: ChunkingSettings = ChunkingSettings(),  # noqa: B008  # frozen
+) -> CueFrames | None:
     """Return how many frames of the cue a row's policy got per episode, with these arguments of the task.
 
     The observation at step s shows the cue if s < cue_steps, counted from `cue_after_steps` on. A policy that
-    reads the last frame gets those of the steps 0, K, 2K, … that are among these; one that reads every frame
-    gets all of them before it predicts. None for a task without a cue phase, or if nothing was rendered.
+    reads the last frame gets those of its inferences, the first at step 0, that are among these; one that
+    reads every frame gets all of them before it predicts. None for a task without a cue phase, if nothing was
+    rendered, or if delays that vary move the inferences.
     """
     spec = find_task(group.key.task)
     if spec is None or spec.candidates is None or not group.results:
@@ -172,10 +194,12 @@ def cue_frames(group: RowEpisodes, env: Mapping[str, Any]) -> CueFrames | None: 
     fewest, most = (total_cue_steps(f(lengths), n_in_turn, gap_steps) for f in (min, max))
     if any((r.n_frames or 0) > (r.n_inferences or 0) for r in group.results):  # it reads every frame
         return CueFrames(fewest, most)
-    k = group.key.n_action_steps
+    interval = chunking.at(group.key.n_action_steps).interval_steps
+    if interval is None:
+        return None
     after = arguments.get("cue_after_steps", 0)
     # Inferences before a step: rounded up, as there is one at step 0.
-    earlier, by_fewest, by_most = (-(-step // k) for step in (after, after + fewest, after + most))
+    earlier, by_fewest, by_most = (-(-step // interval) for step in (after, after + fewest, after + most))
     return CueFrames(by_fewest - earlier, by_most - earlier)
 
 

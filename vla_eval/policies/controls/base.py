@@ -61,7 +61,7 @@ class ScriptedPolicy:
     def __init__(self, context: PolicyContext) -> None:
         """Plan just as many actions as one inference has to give."""
         self._context = context
-        self._n_actions = context.chunking.min_chunk_size
+        self._n_actions = context.chunking.planned_rows
         self._n_dims = len(context.env.action.dims)
         self._rng: dict[int, np.random.Generator] = {}
         self.spec = PolicySpec(

@@ -31,7 +31,7 @@ class PlayerPolicy:
             reads="every",
             cameras=() if kind == "random" else tuple(camera.name for camera in context.env.cameras),
             states=() if kind == "random" else tuple(state.name for state in context.env.states),
-            chunk_size=context.chunking.min_chunk_size,
+            chunk_size=context.chunking.planned_rows,
             privileged=kind == "oracle",
         )
 

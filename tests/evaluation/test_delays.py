@@ -1,0 +1,131 @@
+"""Inference delays as data: no record depends on how a run is made, and a measured one can be replayed."""
+
+import json
+from typing import Any
+
+import pytest
+
+from tests.evaluation import evaluation_bench
+from tests.evaluation.evaluation_bench import TASK, Bench
+from tests.evaluation.resolved import fingerprint, make_plan
+from vla_eval.cli.main import main
+from vla_eval.errors import RecipeError, RunChangedError
+
+pytestmark = pytest.mark.usefixtures("light_workers")
+
+bench = evaluation_bench.bench
+
+DRAWN = {"steps": [0, 1, 3], "p": [0.5, 0.3, 0.2]}
+
+
+@pytest.fixture
+def pair(bench: Bench) -> Bench:
+    bench.write_policy("pair_policy:make")
+    return bench
+
+
+def run(bench: Bench, out: str, chunking: dict[str, Any], **fields: Any) -> list[str]:
+    summary = bench.run(out, chunking=chunking, n_action_steps=[2], **fields)
+    assert (summary.n_open, summary.n_errors) == (0, 0)
+    return bench.lines(out)
+
+
+@pytest.mark.parametrize("mode", ["receding_horizon", "temporal_ensemble", "wait"])
+@pytest.mark.parametrize("delay", [2, DRAWN])
+def test_records_are_the_same_for_any_number_of_workers_and_slots(
+    pair: Bench, mode: str, delay: object
+) -> None:
+    chunking = {"mode": mode, "delay": delay}
+    alone = run(pair, "alone", chunking)
+
+    assert run(pair, "beside", chunking, slots_per_worker=4) == alone
+    assert run(pair, "workers", chunking, workers=2) == alone
+    records = pair.records("alone")
+    assert all((one.delay_steps is None) == (delay == 2) for one in records.values())
+    if delay == 2:  # the chunks of two steps are held for at least once
+        assert all(one.n_held_steps for one in records.values())
+
+
+def test_episodes_of_one_seed_have_the_same_delays_whatever_the_policy(pair: Bench) -> None:
+    pair.run(
+        "out",
+        chunking={"delay": DRAWN},
+        n_action_steps=[1],
+        policies=["random", str(pair.folder / "night.yaml")],
+    )
+    rows = [json.loads(line) for line in pair.lines("out")]
+    by_seed: dict[int, set[tuple[int, ...]]] = {}
+    for row in rows:
+        by_seed.setdefault(row["seed"], set()).add(tuple(row["delay_steps"]))
+
+    assert len(rows) == 12
+    assert all(len(delays) == 1 for delays in by_seed.values())
+    assert len(set().union(*by_seed.values())) > 1
+
+
+class TestTraces:
+    def test_a_measured_run_can_be_played_again_to_the_bit(self, bench: Bench) -> None:
+        bench.write_policy(pause=0.07)  # more than one control step of 50 ms
+        measured = run(bench, "measured", {"delay": "measured"}, episodes=3)
+        trace = {"delay": {"trace": str(bench.folder / "measured")}}
+        bench.write_policy()  # on a faster machine
+
+        assert run(bench, "played", trace, episodes=3) == measured
+        delays = [one.delay_steps for one in bench.records("measured").values()]
+        assert all(own and min(own) >= 2 for own in delays)
+
+    def test_a_trace_is_played_the_same_however_the_run_is_made(self, pair: Bench) -> None:
+        run(pair, "drawn", {"delay": DRAWN}, episodes=3)
+        trace = {"delay": {"trace": str(pair.folder / "drawn")}}
+        alone = run(pair, "alone", trace)  # three episodes are in the trace, three are not
+
+        assert run(pair, "beside", trace, slots_per_worker=4) == alone
+        assert run(pair, "workers", trace, workers=2) == alone
+        assert alone[:3] == pair.lines("drawn")
+
+    def test_what_is_played_is_said(self, pair: Bench) -> None:
+        run(pair, "drawn", {"delay": DRAWN}, episodes=2)
+        config = pair.config(
+            chunking={"delay": {"trace": str(pair.folder / "drawn")}}, n_action_steps=[2], episodes=6
+        )
+
+        (note,) = make_plan(config).notes
+        assert "drawn has 2 of these 6 episodes" in note
+
+    def test_a_run_is_not_continued_with_another_trace_of_the_same_name(self, pair: Bench) -> None:
+        for folder, delay in (("a", DRAWN), ("b", {"steps": [1, 2]})):
+            run(pair, f"{folder}/drawn", {"delay": delay}, episodes=2)
+        run(pair, "out", {"delay": {"trace": str(pair.folder / "a/drawn")}})
+
+        with pytest.raises(RunChangedError, match="delays/drawn"):
+            run(pair, "out", {"delay": {"trace": str(pair.folder / "b/drawn")}})
+
+    def test_a_run_with_one_delay_for_all_is_no_trace(self, pair: Bench) -> None:
+        run(pair, "fixed", {"delay": 1}, episodes=1)
+
+        with pytest.raises(RecipeError, match=r"fixed: expected a run whose delays .* found 1 episodes"):
+            run(pair, "out", {"delay": {"trace": str(pair.folder / "fixed")}})
+
+    def test_the_flag_names_the_run(self, pair: Bench, capsys: pytest.CaptureFixture[str]) -> None:
+        run(pair, "drawn", {"delay": DRAWN}, episodes=2)
+        folder, flags = pair.folder, "--episodes 2 --set simulator=fake --set workers=1"
+        named = ["--out", str(folder / "out"), "--delay-trace", str(folder / "drawn")]
+        code = main(["eval", "--task", TASK, "--policy", "random", *named, *flags.split()])
+
+        assert code == 0
+        assert "drawn has 0 of these 2 episodes" in capsys.readouterr().err
+
+
+def test_a_delay_that_is_a_number_is_recorded_as_before_it_could_vary(bench: Bench) -> None:
+    """Else runs of earlier versions could not be continued."""
+    old = bench.config(chunking={"delay_steps": 1})
+
+    assert fingerprint(old) == fingerprint(bench.config(chunking={"delay": 1}))
+    assert fingerprint(bench.config()) != fingerprint(old)
+
+
+def test_a_policy_that_does_not_join_its_chunks_is_refused_where_it_has_to(pair: Bench) -> None:
+    summary = None
+    with pytest.raises(Exception, match=r"does not read what is committed.*mode=rtc"):
+        summary = pair.run("out", chunking={"mode": "rtc"})
+    assert summary is None
