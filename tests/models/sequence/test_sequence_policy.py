@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from torch import Tensor
 
 from tests.models.sample_frames import BASE, WRIST, at, between, frames
 from tests.models.sequence.test_sequence_parts import SMALL_OPTIONS
@@ -31,11 +32,15 @@ def tiny_policy(recorded: Path, **fields: Any) -> Any:
     return MikasaSequencePolicy(policy_config(recipe, dataset, device="cpu")).eval()
 
 
+def predicted(policy: MikasaSequencePolicy, tokens: Tensor, answers: Tensor) -> Tensor:
+    return policy.network.chunks(policy.network.decide(tokens, answers))
+
+
 @pytest.mark.parametrize("core", CORES)
 def test_it_acts_frame_by_frame_as_it_was_trained_on_whole_episodes(recorded: Path, core: str) -> None:
     policy, seen = tiny_policy(recorded, core=core), frames(5, n_episodes=2)
     tokens = policy.network.tokens(torch.stack([seen[BASE], seen[WRIST]], dim=2), seen["observation.state"])
-    whole = policy.network.predict(tokens, policy.network.read(tokens, policy.network.begin(2))[0]).actions
+    whole = predicted(policy, tokens, policy.network.read(tokens, policy.network.begin(2))[0])
     memory = None
     for first, stop in ((0, 1), (1, 4), (4, 5)):  # the harness shows what is new since it last asked
         if CORES[core].remembers:
@@ -52,10 +57,11 @@ def test_under_autocast_all_but_the_encoders_convolutions_stay_in_float32(record
         encoded = network.encoders[0].features(images[:, 0, 0])
         tokens = network.tokens(images, seen["observation.state"])
         answers, memory = network.read(tokens, network.begin(2))
-        predicted = network.predict(tokens, answers)
+        decided = network.decide(tokens, answers)
+        made = network.chunks(decided), network.goal_m(decided)
     assert encoded.dtype == torch.bfloat16
     halves = {torch.bfloat16, torch.float16}
-    assert not halves & {x.dtype for x in (tokens, answers, *memory, *predicted)}
+    assert not halves & {x.dtype for x in (tokens, answers, *memory, *made)}
     exact = network.tokens(images, seen["observation.state"])
     torch.testing.assert_close(tokens, exact, atol=0.02, rtol=0.02)
 
@@ -76,7 +82,7 @@ def test_when_it_acts_it_reads_the_target_return_and_the_actions_that_it_has_dec
         tokens = policy.network.tokens(images, seen["observation.state"])
         actions = torch.stack([chunk[:, 0] for chunk in chunks], dim=1)
         given = Demonstrated(returns=torch.full((2, 5), 2.5), actions=actions)
-        whole = policy.network.predict(tokens, policy.network.answers(tokens, given)).actions.clamp(-1, 1)
+        whole = predicted(policy, tokens, policy.network.answers(tokens, given)).clamp(-1, 1)
     torch.testing.assert_close(torch.stack(chunks, dim=1), whole, atol=1e-5, rtol=1e-5)
 
 
@@ -88,7 +94,7 @@ def test_with_returns_and_without_actions_it_acts_as_if_a_demonstration_had_been
     policy, seen = tiny_policy(recorded, core=core, **fields), frames(5, n_episodes=2)
     tokens = policy.network.tokens(torch.stack([seen[BASE], seen[WRIST]], dim=2), seen["observation.state"])
     given = Demonstrated(returns=torch.full((2, 5), 2.5), actions=torch.full((2, 5, 7), torch.nan))
-    whole = policy.network.predict(tokens, policy.network.answers(tokens, given)).actions
+    whole = predicted(policy, tokens, policy.network.answers(tokens, given))
     memory = None
     for step in range(5):
         if CORES[core].remembers:
@@ -134,7 +140,7 @@ def test_without_goal_and_weights_the_loss_is_the_mean_squared_error(recorded: P
         loss, _ = policy.train().forward(batch)
         images = torch.stack([batch[BASE], batch[WRIST]], dim=2)[:, :-1]
         tokens = policy.network.tokens(images, batch["observation.state"][:, :-1])
-        found = policy.network.predict(tokens, policy.network.answers(tokens, None)).actions
+        found = predicted(policy, tokens, policy.network.answers(tokens, None))
     wanted = batch["action"].unfold(1, 3, 1).transpose(-1, -2)
     torch.testing.assert_close(loss, (found - wanted).square().mean(), atol=1e-5, rtol=1e-5)
 

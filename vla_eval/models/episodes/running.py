@@ -10,7 +10,7 @@ from typing import Any, NamedTuple  # lerobot is untyped
 import torch
 from torch import Tensor
 
-from vla_eval.core import EpisodeStart
+from vla_eval.core import CommittedActions, EpisodeStart
 from vla_eval.errors import InvalidActionError
 from vla_eval.models.families import family_of
 from vla_eval.models.shared.earlier_frames import FrameMemory
@@ -33,6 +33,7 @@ class Episode:
     # the earlier frames that the policy is shown as further images; None: it is shown none
     earlier: FrameMemory | None = None
     step: int = 0  # of the newest frame
+    committed: CommittedActions | None = None  # what the next chunk has to join
 
     def shown(self, unseen: Sequence[Frame], *, step: int, n_kept: int) -> "Episode":
         """Return the episode after these frames, of which an inference may read the newest `n_kept`."""

@@ -23,7 +23,7 @@ from vla_eval.models.sequence.sizes import (
     options_of,
 )
 from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, LANGUAGE, Stage, Stages, image_shape
-from vla_eval.strict.bounds import check_bounds
+from vla_eval.strict.bounds import check_bounds, require
 
 TYPE = "mikasa_sequence"
 
@@ -39,7 +39,12 @@ class MikasaSequenceConfig(EpisodeConfig):
     encoder: str = "keypoints"  # of images, a name of `ENCODERS`
     # a name of `HEADS`. `gated` reads the observation and the core's answer; `linear`, of the sequence
     # models' papers, reads the answer alone and bounds actions by tanh.
+    # `flow` makes the chunk by flow matching from what `gated` reads.
     head: str = "gated"
+    num_inference_steps: int = 10  # of the integration from noise to actions, with head=flow
+    # in training, up to so many first actions of a chunk are given (drawn), and only the rest is learned: for
+    # chunking.mode=prefix
+    prefix_steps: int = 0
     tokens: str = "step"  # of a step, a name of `TOKENS`
     state_in_token: bool = True  # the token of an observation has the state in it, not only the images
     reward: str | None = None  # whose return to go is a token, a `RewardKind`. None: no token needs one.
@@ -62,9 +67,10 @@ class MikasaSequenceConfig(EpisodeConfig):
         self.check_choice("encoder", ENCODERS)
         self.check_choice("head", HEADS)
         self.check_choice("tokens", TOKENS)
-        counts = ("width", "layers", "heads", "context_steps")
+        counts = ("width", "layers", "heads", "context_steps", "num_inference_steps")
         check_bounds(self, {**dict.fromkeys(counts, (1, math.inf)), "dropout": (0, BELOW_ONE)})
         self._check_width()
+        self._check_head()
         kinds = get_args(RewardKind)
         if self.reads_returns and self.reward not in kinds:
             raise RecipeError(
@@ -113,6 +119,31 @@ class MikasaSequenceConfig(EpisodeConfig):
         _, episodes = np.unique(columns["episode_index"], return_inverse=True)
         sums = np.bincount(episodes.reshape(-1), weights=columns[key].reshape(-1).astype(np.float64))
         self.target_return = float(sums.max())
+
+    @property
+    def noise_shape(self) -> tuple[int, int] | None:
+        """Shape of the noise that a chunk is made from; None if it is made of none."""
+        return (self.chunk_size, int(self.action_feature.shape[0])) if self.head == "flow" else None
+
+    def _check_head(self) -> None:
+        require(
+            0 <= self.prefix_steps < self.chunk_size,
+            "prefix_steps",
+            self.prefix_steps,
+            f"0 to {self.chunk_size - 1}, less than chunk_size",
+        )
+        require(
+            self.head != "linear" or not self.prefix_steps,
+            "prefix_steps",
+            self.prefix_steps,
+            "0 with head=linear",
+        )
+        require(
+            self.head != "flow" or not self.reads_actions,
+            "head",
+            self.head,
+            f"another with tokens={self.tokens}",
+        )
 
     def _check_width(self) -> None:
         row, options = CORES[self.core], options_of(self.core, self.core_options)

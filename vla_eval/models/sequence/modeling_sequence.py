@@ -1,11 +1,13 @@
 """Plain policies as a LeRobot policy: imitation over whole episodes, memory from frame to frame."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple  # lerobot is untyped
 
 import torch
+from lerobot.policies.common.flow_matching import euler_integrate, sample_noise
+from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from torch import Tensor, nn
-from torch.nn import functional
 
 from vla_eval.features import REWARD_KEY, STATE_KEY, RewardKind
 from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
@@ -16,28 +18,10 @@ from vla_eval.models.sequence.configuration_sequence import TYPE, MikasaSequence
 from vla_eval.models.sequence.core import CoreMemory
 from vla_eval.models.sequence.cores import make_core
 from vla_eval.models.sequence.encoders import Cameras
+from vla_eval.models.sequence.heads import ChunkHead, FlowHead, Gated
 from vla_eval.models.sequence.sizes import CORES
 from vla_eval.models.shared.precision import in_float32
-
-
-class Predicted(NamedTuple):
-    """Actions (B, T, chunk, action), and where the demonstration's tool centre point ends, (B, T, 3)."""
-
-    actions: Tensor
-    goal_m: Tensor
-
-
-class Gated(nn.Module):
-    """A layer whose outputs are products: a linear map, gated by another one (Shazeer 2020, SwiGLU)."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.values, self.gates = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Return (…, outputs) of (…, inputs)."""
-        gated: Tensor = functional.silu(self.gates(inputs)) * self.values(inputs)
-        return gated
+from vla_eval.models.shared.prefix import Prefix, drawn_prefix
 
 
 class Demonstrated(NamedTuple):
@@ -70,10 +54,14 @@ class SequenceNetwork(nn.Module):
             tokens_per_step=config.tokens_per_step,
             given=config.core_options,
         )
-        if config.head == "gated":
+        self.is_gated = config.head != "linear"
+        if self.is_gated:
             self.head = nn.Sequential(Gated(2 * width, width), nn.LayerNorm(width), Gated(width, width))
         self.shape = (config.chunk_size, int(config.action_feature.shape[0]))
-        self.actions = nn.Linear(width, self.shape[0] * self.shape[1])
+        self.flow = FlowHead(width, self.shape) if config.head == "flow" else None
+        if self.flow is None:
+            self.actions = nn.Linear(width, self.shape[0] * self.shape[1])
+            self.prefix = ChunkHead(width, self.shape, prefix_steps=config.prefix_steps)
         self.goal = nn.Linear(width, SPACE)
         if config.reads_returns:
             self.returns = nn.Linear(1, width)
@@ -83,7 +71,7 @@ class SequenceNetwork(nn.Module):
 
     def begin(self, n_episodes: int) -> CoreMemory:
         """Return the memory before the first step; its last tensor is the core's answer, (B, width)."""
-        nothing = self.actions.weight.new_zeros(n_episodes, self.actions.in_features)
+        nothing = self.goal.weight.new_zeros(n_episodes, self.goal.in_features)
         return (*self.core.begin(n_episodes), nothing)
 
     def tokens(self, images: Tensor, state: Tensor, said: Tensor | None = None) -> Tensor:
@@ -129,19 +117,35 @@ class SequenceNetwork(nn.Module):
             found.append(answer[:, 1:])
             if not self.config.reads_actions:
                 continue
-            action = self.predict(token, found[-1]).actions[:, :, 0].clamp(-1, 1)
+            action = self.chunks(self.decide(token, found[-1]))[:, :, 0].clamp(-1, 1)
             _, kept = self.core(self.executed(action.to(token.dtype)), kept)
         return torch.cat(found, dim=1), (*kept, found[-1][:, 0])
 
     @in_float32
-    def predict(self, tokens: Tensor, answers: Tensor) -> Predicted:
-        """Return what is predicted at each step, both inputs (B, T, width)."""
-        is_gated = self.config.head == "gated"
-        decided = self.head(torch.cat([tokens, answers], dim=-1)) if is_gated else answers
-        actions = self.actions(decided).unflatten(-1, self.shape)
-        return Predicted(
-            actions=actions if is_gated else actions.tanh(), goal_m=self.goal(decided) / POSITION_SCALE
-        )
+    def decide(self, tokens: Tensor, answers: Tensor) -> Tensor:
+        """Return what is decided at each step, (B, T, width), as both inputs are."""
+        decided: Tensor = self.head(torch.cat([tokens, answers], dim=-1)) if self.is_gated else answers
+        return decided
+
+    @in_float32
+    def goal_m(self, decided: Tensor) -> Tensor:
+        """Return where the demonstration's tool centre point ends, (B, T, 3)."""
+        goal: Tensor = self.goal(decided) / POSITION_SCALE
+        return goal
+
+    @in_float32
+    def chunks(self, decided: Tensor, prefix: Prefix | None = None) -> Tensor:
+        """Return chunks (B, T, chunk, action) of a head that makes them at once."""
+        actions: Tensor = self.actions(self.prefix(decided, prefix)).unflatten(-1, self.shape)
+        actions = actions if self.is_gated else actions.tanh()
+        return actions if prefix is None else prefix.put_into(actions)
+
+    @in_float32
+    def errors(self, decided: Tensor, actions: Tensor, prefix: Prefix | None) -> Tensor:
+        """Return the squared errors (B, T, chunk) of what is learned: actions, or velocities of a flow."""
+        if self.flow is not None:
+            return self.flow.errors(decided, actions, prefix)
+        return (self.chunks(decided, prefix) - actions).square().mean(dim=-1)
 
 
 class MikasaSequencePolicy(EpisodePolicy):
@@ -155,6 +159,8 @@ class MikasaSequencePolicy(EpisodePolicy):
         self.config: MikasaSequenceConfig = config
         self.network = SequenceNetwork(config)
         self.set_memory(self.network.begin, remembers=CORES[config.core].remembers)
+        self.draws_nothing = config.noise_shape is None
+        self.rtc_processor: RTCProcessor | None = None
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
@@ -167,12 +173,13 @@ class MikasaSequencePolicy(EpisodePolicy):
         encoded = network.tokens(episodes.images[None], episodes.state[first][None], said)[0]
         tokens = encoded[episodes.frames]
         answers = network.answers(tokens, self._demonstrated(batch, episodes))
-        predicted = network.predict(tokens, answers)
-        errors = (predicted.actions - episodes.actions).square().mean(dim=-1)
-        imitation = weighted_mean(errors, episodes.counts)
+        decided = network.decide(tokens, answers)
+        prefix = drawn_prefix(episodes.actions, config.prefix_steps) if config.prefix_steps else None
+        counts = episodes.counts if prefix is None else episodes.counts * ~prefix.mask
+        imitation = weighted_mean(network.errors(decided, episodes.actions, prefix), counts)
         # Weighted as the actions are: once the arm moves, its motion gives the goal away, and the one frame
         # at which the choice has to be made from memory would count for little.
-        goal = goal_missed(predicted.goal_m, episodes.goal_m, episodes.goal_counts)
+        goal = goal_missed(network.goal_m(decided), episodes.goal_m, episodes.goal_counts)
         parts = {"imitation": imitation, "goal": goal}
         loss = imitation + config.goal_weight * goal
         return loss, {name: float(part.detach()) for name, part in parts.items()}
@@ -195,18 +202,49 @@ class MikasaSequencePolicy(EpisodePolicy):
         _, after = self.network.read(tokens, before)
         return after
 
+    def supports_rtc(self) -> bool:
+        """Whether chunks can be guided by LeRobot's `RTCProcessor`."""
+        return self.network.flow is not None
+
+    def init_rtc_processor(self) -> None:
+        """Guide chunks as `config.rtc_config` says, as LeRobot's flow policies do."""
+        self.rtc_processor = RTCProcessor(self.config.rtc_config)
+
     @torch.no_grad()
     def predict_action_chunk(
-        self, batch: dict[str, Tensor], memory: CoreMemory | None = None, **kwargs: Any
+        self,
+        batch: dict[str, Tensor],
+        memory: CoreMemory | None = None,
+        *,
+        noise: Tensor | None = None,
+        prefix: Prefix | None = None,
+        **rtc: Any,
     ) -> Tensor:
-        """Return (B, chunk, action) for one frame per episode, which `memory`, if any, has already."""
+        """Return (B, chunk, action) for one frame per episode, which `memory`, if any, has already.
+
+        `noise` (B, chunk, action): of a flow, None: drawn by torch. `prefix`: rows that are decided, for a
+        policy that was trained with prefixes. `rtc`: `inference_delay`, `prev_chunk_left_over` and
+        `execution_horizon`, as LeRobot's `RTCProcessor` takes them.
+        """
         self.eval()
         self.check_shown(memory)
         images, state = stacked_images(batch, self.config)[:, None], batch[STATE_KEY][:, None]
         tokens = self.network.tokens(images, state, said_at_each_step(self.network.sentence, batch, 1))
         if memory is None:
             _, memory = self.network.read(tokens, self.network.begin(len(tokens)))
-        return self.network.predict(tokens, memory[-1][:, None]).actions[:, 0].clamp(-1, 1)
+        decided = self.network.decide(tokens, memory[-1][:, None])[:, 0]
+        if self.network.flow is None:
+            return self.network.chunks(decided, prefix).clamp(-1, 1)
+        if noise is None:
+            noise = sample_noise((len(decided), *self.network.shape), decided.device)
+        processor = self.rtc_processor if rtc else None
+        return self.network.flow.sample(
+            decided,
+            noise,
+            self.config.num_inference_steps,
+            prefix=prefix,
+            integrate=partial(euler_integrate, rtc_processor=processor, rtc_enabled=bool(rtc), **rtc),
+        ).clamp(-1, 1)
 
 
 REWARD_PADDING_KEY = f"{REWARD_KEY}_is_pad"

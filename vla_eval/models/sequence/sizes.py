@@ -168,4 +168,7 @@ def encoder_stages(image_px: int, n_images: int, *, nature: bool) -> Stages:
 
 TOKENS = {"step": 1, "return_observation": 2, "return_observation_action": 3}
 """How many a step has: the observation; with the return to go before it; with the action after it, too."""
-HEADS = ("gated", "linear")
+HEADS = ("gated", "linear", "flow")
+N_FLOW_LAYERS = 3
+FLOW_TIME = {"alpha": 1.5, "beta": 1.0, "scale": 0.999, "offset": 0.001}
+"""How times are drawn in training: π0's, Black et al. 2024 (arXiv:2410.24164), appendix B; as in LeRobot."""

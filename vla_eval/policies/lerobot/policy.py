@@ -22,7 +22,7 @@ from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, histo
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import InvalidActionError, SpecMismatchError
-from vla_eval.features import CAMERA_KEYS, PROPRIO_STATES, StateKind
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, PROPRIO_STATES, StateKind
 from vla_eval.models.episodes.memory import memory_of, recall, remembers, remembers_in_rows, remembers_singly
 from vla_eval.models.episodes.running import (
     Episode,
@@ -41,6 +41,7 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.lerobot.compiling import begin_pass, compile_network, warm_up
 from vla_eval.policies.lerobot.device import autocast, choose_device, cuda_devices
 from vla_eval.policies.lerobot.inputs import InputMap, InputOptions, check_training, input_map
+from vla_eval.policies.lerobot.joining import Committed, Joining, joining_of
 from vla_eval.specs import EnvSpec, PolicySpec
 
 
@@ -73,8 +74,9 @@ class LeRobotPolicy:
         batch: bool | None = False,
         is_compiled: bool = False,
         n_slots: int = 1,
+        joining: Joining | None = None,
     ) -> None:
-        self._loaded, self._inputs = loaded, inputs
+        self._loaded, self._inputs, self._joining = loaded, inputs, joining
         self._remembers = remembers(loaded.policy)
         self._by_step = asked_for_steps(loaded.config.type)
         self._earlier = _earlier_frames(loaded.config)
@@ -113,6 +115,7 @@ class LeRobotPolicy:
             cameras=tuple(inputs.cameras),
             states=PROPRIO_STATES if inputs.state is not None else (),
             chunk_size=chunk_size(loaded.config),
+            reads_committed=joining is not None,
         )
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
@@ -139,25 +142,33 @@ class LeRobotPolicy:
 
     def act_batch(self, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
         """Infer for each window; each draws its own, and refuses a row that is not there or is taken."""
-        due = [
-            self._slots[window.slot].shown(
-                [self._inputs.tensors(observation) for observation in window.frames],
-                step=window.last.step,
-                n_kept=1 - min(self._deltas, default=0),
-            )
-            for window in windows
-        ]
-        if not self._batch:
-            inferred = [self._infer([episode])[0] for episode in due]
-        elif self._n_slots == 1:
-            inferred = self._infer(due)
-        else:
-            of_rows = self._infer(in_rows(due, self._n_slots))
-            inferred = [of_rows[episode.start.row] for episode in due]
+        due = [self._due(window) for window in windows]
+        inferred: dict[int, _Inferred] = {}
+        for episodes in alike(due):
+            found = self._infer_alike(episodes)
+            inferred.update(zip((one.start.slot for one in episodes), found, strict=True))
         # Only now: a call that raises leaves all episodes as they were, and may be made again.
-        for episode, (_, memory) in zip(due, inferred, strict=True):
-            self._slots[episode.start.slot] = replace(episode, unseen=(), memory=memory)
-        return [chunk for chunk, _ in inferred]
+        for episode in due:
+            memory = inferred[episode.start.slot].memory
+            self._slots[episode.start.slot] = replace(episode, unseen=(), memory=memory, committed=None)
+        return [inferred[episode.start.slot].chunk for episode in due]
+
+    def _due(self, window: ObservationWindow) -> Episode:
+        shown = self._slots[window.slot].shown(
+            [self._inputs.tensors(observation) for observation in window.frames],
+            step=window.last.step,
+            n_kept=1 - min(self._deltas, default=0),
+        )
+        return replace(shown, committed=window.committed)
+
+    def _infer_alike(self, due: Sequence[Episode]) -> list[_Inferred]:
+        """Infer for episodes that can share a pass."""
+        if not self._batch:
+            return [self._infer([episode])[0] for episode in due]
+        if self._n_slots == 1:
+            return self._infer(due)
+        of_rows = self._infer(in_rows(due, self._n_slots))
+        return [of_rows[episode.start.row] for episode in due]
 
     @torch.no_grad()
     def _infer(self, rows: Sequence[Episode]) -> list[_Inferred]:
@@ -177,7 +188,11 @@ class LeRobotPolicy:
             if self._remembers:
                 extra["memory"], memories = self._recall(rows)
             frames = [episode.read(self._deltas, masks_history=self._masks_history) for episode in rows]
-            batch = self._loaded.preprocessor(batch_of(frames, rows))
+            told = Committed.of([row.committed for row in rows]) if self._joining else None
+            actions = {} if told is None else {ACTION_KEY: told.actions}
+            batch = self._loaded.preprocessor({**batch_of(frames, rows), **actions})
+            if told is not None and self._joining is not None:
+                extra |= told.arguments(batch, self._joining, self._loaded, policy=self.spec.name)
             if self._by_step:
                 (episode,) = rows
                 if len(episode.unseen) != 1:
@@ -220,6 +235,15 @@ class LeRobotPolicy:
         return [ActionChunk(actions=np.ascontiguousarray(row)) for row in rows]
 
 
+def alike(episodes: Sequence[Episode]) -> list[list[Episode]]:
+    """Return the episodes in groups with as many committed steps: each is a pass of its own."""
+    groups: dict[tuple[int, int] | None, list[Episode]] = {}
+    for episode in episodes:
+        told = episode.committed
+        groups.setdefault(None if told is None else (len(told.actions), told.n_frozen), []).append(episode)
+    return list(groups.values())
+
+
 def _earlier_frames(config: Any) -> FrameMemory | None:
     """Return the memory of a policy that is shown earlier frames before the first one; None: it is not."""
     choice = config.frame_choice() if hasattr(config, "frame_choice") else None
@@ -258,6 +282,13 @@ def make_lerobot(
         refuse_differences(differences(facts, Asked(context.env)), policy=context.name, task=context.env.task)
         inputs = input_map(loaded.config, loaded.preprocessor, asked, context.env, policy=context.name)
         check_training(facts, inputs, loaded, context.env, policy=context.name)
+        joining = joining_of(loaded, context.chunking, policy=context.name, is_compiled=compile)
         return LeRobotPolicy(
-            context.name, loaded, inputs, batch=batch, is_compiled=compile, n_slots=context.n_slots
+            context.name,
+            loaded,
+            inputs,
+            batch=batch,
+            is_compiled=compile,
+            n_slots=context.n_slots,
+            joining=joining,
         )

@@ -1,0 +1,26 @@
+"""The first actions of a chunk that are already decided. Knows only torch."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+
+class Prefix(NamedTuple):
+    """The first rows of chunks that are already decided."""
+
+    actions: Tensor  # (…, chunk, action); what is not of the prefix has no meaning
+    mask: Tensor  # (…, chunk) bool, True for rows of the prefix
+
+    def put_into(self, actions: Tensor) -> Tensor:
+        """Return actions (…, chunk, action) with the prefix in their place."""
+        return torch.where(self.mask[..., None], self.actions, actions)
+
+
+def drawn_prefix(actions: Tensor, most_steps: int) -> Prefix:
+    """Return a prefix of 0 to `most_steps` rows, drawn for each chunk (…, chunk, action), for training.
+
+    Source: Black et al. 2025 (arXiv:2512.05964), section 3: the delay is simulated in training.
+    """
+    lengths = torch.randint(0, most_steps + 1, (*actions.shape[:-2], 1), device=actions.device)
+    return Prefix(actions, torch.arange(actions.shape[-2], device=actions.device) < lengths)
