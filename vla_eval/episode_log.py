@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from vla_eval.chunking import ChunkingSpec, Executed
+from vla_eval.chunking import ChunkingSettings, ChunkingSpec, Executed
 from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, StepResult
 from vla_eval.errors import InvalidActionError, MissingInstructionError, SimulationError, SpecMismatchError
 from vla_eval.motion import HELD, motion_of
@@ -158,6 +158,11 @@ class EpisodeLog:
 def check_execution(spec: PolicySpec, chunking: ChunkingSpec) -> None:
     """Raise `SpecMismatchError` unless the policy's chunks can be executed as asked for."""
     chunking.check_chunk_size(spec.chunk_size, policy=spec.name)
+    check_reads_committed(spec, chunking)
+
+
+def check_reads_committed(spec: PolicySpec, chunking: ChunkingSettings) -> None:
+    """Raise `SpecMismatchError` unless the policy takes what the mode tells it."""
     if chunking.execution.commits and not spec.reads_committed:
         raise SpecMismatchError(
             f"policy '{spec.name}' does not read what is committed, which chunking.mode={chunking.mode} "

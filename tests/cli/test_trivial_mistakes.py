@@ -119,6 +119,9 @@ MISTAKES: dict[str, dict[str, str]] = {
     },
     "serve": {
         "serve --policy orcale": "Did you mean 'oracle'",
+        "serve --policy random --chunking-mode rct": "Did you mean 'rtc'",
+        "serve --policy random --set delay=3": "expected fields of rtc, with --chunking-mode rtc",
+        "serve --policy random --chunking-mode rtc": "does not read what is committed",
         "serve --policy runs/nowhere": "runs/nowhere",
         "serve --policy empty": "empty",
         "serve --policy random --task RememberColour3-v0": "RememberColour3-v0",

@@ -129,3 +129,52 @@ def test_a_policy_that_does_not_join_its_chunks_is_refused_where_it_has_to(pair:
     with pytest.raises(Exception, match=r"does not read what is committed.*mode=rtc"):
         summary = pair.run("out", chunking={"mode": "rtc"})
     assert summary is None
+
+
+# Its chunk continues what is committed: what was lost on the way would show.
+JOINING_MODULE = """
+import numpy as np
+from vla_eval.core import ActionChunk
+from vla_eval.specs import PolicySpec
+
+CHUNK = 6
+
+
+class Policy:
+    def __init__(self, context):
+        self.spec = PolicySpec(name="joins", reads="last", cameras=(), states=("qpos",), chunk_size=CHUNK,
+                               reads_committed=context.chunking.execution.commits)
+        self.rng = {}
+
+    def reset(self, episodes):
+        self.rng.update({e.slot: np.random.default_rng([e.seed, e.run]) for e in episodes})
+
+    def act_batch(self, windows):
+        return [self.act(window) for window in windows]
+
+    def act(self, window):
+        told, actions = window.committed, self.rng[window.slot].uniform(-1, 1, (CHUNK, 7)).astype(np.float32)
+        if told is not None:
+            actions[: len(told.actions)] = told.actions * np.float32(0.5)
+            actions[: told.n_frozen] = told.actions[: told.n_frozen]
+        return ActionChunk(actions=actions)
+
+
+def make(context, *, checkpoint):
+    return Policy(context)
+"""
+
+
+@pytest.mark.parametrize("delay", [1, DRAWN])
+def test_what_is_committed_reaches_the_policy_over_a_socket_as_it_does_in_process(
+    bench: Bench, delay: object
+) -> None:
+    (bench.folder / "join_policy.py").write_text(JOINING_MODULE)
+    bench.write_policy("join_policy:make", checkpoint="none")
+    chunking = {"mode": "rtc", "delay": delay}
+    alone = run(bench, "alone", chunking)
+
+    assert run(bench, "beside", chunking, slots_per_worker=4) == alone
+    shared = {"inference": "shared", "inference_max_batch": 4, "workers": 2}
+    assert run(bench, "served", chunking, **shared) == alone
+    assert run(bench, "untold", {"delay": delay}) != alone

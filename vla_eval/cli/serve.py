@@ -5,14 +5,15 @@ import ipaddress
 import logging
 import os
 import sys
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import api_key_of, task_argument
-from vla_eval.errors import MAX_SHOWN
+from vla_eval.errors import MAX_SHOWN, RecipeError, unknown_name
 from vla_eval.strict.devices import check_device
 from vla_eval.workers.start import WORKER_ENVIRONMENT
 
 if TYPE_CHECKING:
+    from vla_eval.chunking import ChunkingSettings
     from vla_eval.policies.compiled import Compilation
 
 DESCRIPTION = """Serve a policy over WebSocket, until Ctrl-C or SIGTERM. `mikasa-vla eval --policy ws://HOST:PORT`
@@ -51,6 +52,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--device", type=check_device, metavar="D", help="auto, cpu, cuda, cuda:1 (the recipe's)"
     )
     parser.add_argument("--compile", action="store_true", help="compile its network first (docs/serve.md)")
+    parser.add_argument(
+        "--chunking-mode", metavar="M", help="rtc, prefix: chunks join what the client says is committed"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        dest="overrides",
+        metavar="rtc.FIELD=VALUE",
+        help="with rtc: a field of chunking.rtc (docs/real_time.md)",
+    )
     parser.add_argument("--debug", action="store_true", help="send errors with their traceback")
 
 
@@ -89,6 +101,7 @@ def run(args: argparse.Namespace) -> int:
             max_batch=args.max_batch,
             device=args.device,
             compile=args.compile,
+            chunking=_chunking(args),
         )
     )
     for line in hosted.ignored:
@@ -102,6 +115,25 @@ def run(args: argparse.Namespace) -> int:
 
     run_server(hosted, options, ready=ready)
     return 0
+
+
+def _chunking(args: argparse.Namespace) -> "ChunkingSettings":
+    from vla_eval.chunking import EXECUTIONS, ChunkingSettings
+    from vla_eval.config.files import apply_overrides
+    from vla_eval.strict.decoding import decode
+
+    modes = [name for name, execution in EXECUTIONS.items() if execution.commits]
+    data: dict[str, Any] = {}  # Any: plain data
+    if args.chunking_mode is not None:
+        if args.chunking_mode not in modes:
+            raise unknown_name("chunking mode", args.chunking_mode, modes, where="--chunking-mode")
+        data["mode"] = args.chunking_mode
+    apply_overrides(data, args.overrides, cls=ChunkingSettings)
+    if data.keys() - {"mode", "rtc"} or ("rtc" in data and data.get("mode") != "rtc"):
+        raise RecipeError(
+            "--set: expected fields of rtc, with --chunking-mode rtc; all else is the client's."
+        )
+    return decode(ChunkingSettings, data, where="serve")
 
 
 def _is_loopback(host: str) -> bool:

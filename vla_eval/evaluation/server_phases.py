@@ -73,6 +73,7 @@ def with_servers(
         policy=plan.shared[phase.policy],
         max_batch=config.inference_max_batch,
         compile=bool(phase.jobs[0].group.args.get(COMPILE)),
+        chunking=config.chunking,
     )
     adapters = [job.group.adapter for job in phase.jobs[:1]]
     with SharedServers(

@@ -4,7 +4,7 @@ The environment that the policy is made for is the description of ours; an evalu
 its own simulator.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import chain
 from pathlib import Path
 from typing import Any  # Any: arguments of an adapter
@@ -25,6 +25,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import BatchPolicy, Policy
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
+from vla_eval.episode_log import check_reads_committed
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.policies.compiled import Compilation, CompiledPolicy
 from vla_eval.policies.context import PolicyContext
@@ -59,6 +60,7 @@ class HostOptions:
         max_batch: rows of a pass.
         device: what it runs on; None: as the recipe says.
         compile: whether its network is compiled; False: as the recipe says.
+        chunking: how its chunks join, see `chunking.mode`; all else in it is the client's.
     """
 
     policy: str
@@ -67,6 +69,7 @@ class HostOptions:
     max_batch: int = 16
     device: str | None = None
     compile: bool = False
+    chunking: ChunkingSettings = field(default_factory=ChunkingSettings)
 
     def __post_init__(self) -> None:
         check_bounds(self, {"max_batch": (1, MAX_SERVER_ROWS), "n_action_steps": (1, MAX_STEPS)})
@@ -123,6 +126,7 @@ def host_policy(options: HostOptions) -> HostedPolicy:
     policy = _make(recipe, options, env)
     _refuse_privileged(recipe.name, policy.spec.privileged)
     check_compatible(policy.spec, env)
+    check_reads_committed(policy.spec, options.chunking)
     end_effector = getattr(policy, "proprioception", None) == "eef"
     reader = observation_reader(policy.spec, env, end_effector=end_effector)
     return HostedPolicy(
@@ -165,7 +169,7 @@ def _make(recipe: Recipe[PolicyRecipe], options: HostOptions, env: EnvSpec) -> P
     context = PolicyContext(
         name=recipe.name,
         env=env,
-        chunking=ChunkingSettings().at(n_action_steps),
+        chunking=_joining(options.chunking).at(n_action_steps),
         n_candidates=0,  # a policy that depends on them is privileged
         n_slots=options.max_batch,
     )
@@ -177,6 +181,13 @@ def _make(recipe: Recipe[PolicyRecipe], options: HostOptions, env: EnvSpec) -> P
                 f"policy '{recipe.name}' depends on the task. Name it: --task RememberColor3-v0."
             ) from exc
         raise
+
+
+def _joining(chunking: ChunkingSettings) -> ChunkingSettings:
+    """Return what a policy has to know to join its chunks; their execution is the client's."""
+    if not chunking.execution.commits:
+        return ChunkingSettings()
+    return ChunkingSettings(mode=chunking.mode, rtc=chunking.rtc)
 
 
 def _refuse_privileged(name: str, is_privileged: bool) -> None:
@@ -222,7 +233,11 @@ def _describe(
         versions={name: version for name, version in versions.items() if version is not None},
         training_seeds=training_seeds(recipe.value.adapter, recipe.value.args) or None,
         sentences=training_sentences(recipe.value.adapter, recipe.value.args),
-        other={COMPILE: True} if options.compile or recipe.value.args.get(COMPILE) else {},
+        chunking_mode=options.chunking.mode if policy.spec.reads_committed else None,
+        other={
+            **({COMPILE: True} if options.compile or recipe.value.args.get(COMPILE) else {}),
+            **({"rtc": asdict(options.chunking.rtc)} if options.chunking.execution.is_guided else {}),
+        },
     )
 
 

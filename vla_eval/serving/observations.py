@@ -6,12 +6,12 @@ from typing import Any  # Any: what a client sends
 
 import numpy as np
 
-from vla_eval.core import FloatArray, ImageArray, Observation
+from vla_eval.core import CommittedActions, FloatArray, ImageArray, Observation
 from vla_eval.errors import SpecMismatchError, VlaEvalError, did_you_mean, some_of
 from vla_eval.features import PROPRIO_STATES, STATE_NAMES
 from vla_eval.specs import EnvSpec, PolicySpec
 from vla_eval.strict.json_text import shown
-from vla_eval.wire.metadata import CameraImage
+from vla_eval.wire.metadata import COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY, CameraImage
 from vla_eval.wire.numbers import FLOAT_TYPES, NumbersError, as_state
 
 CAMERA_WIRE_KEYS = {"base_camera": "observation/image", "hand_camera": "observation/wrist_image"}
@@ -34,6 +34,8 @@ class ObservationReader:
     states: Mapping[str, tuple[str, ...]]
     # whether a state may also be the 10 numbers of the kind `eef`, which the policy reads
     end_effector: bool
+    # of a policy whose chunks join: rows and numbers of a chunk; None: it is told nothing
+    chunk_shape: tuple[int, int] | None = None
 
     @property
     def state_layouts(self) -> dict[str, tuple[str, ...]]:
@@ -56,6 +58,23 @@ class ObservationReader:
             images={name: _read_image(request, camera) for name, camera in self.cameras.items()},
             state=self._read_state(request) if self.states else {},
         )
+
+    def read_committed(self, request: Mapping[str, Any]) -> CommittedActions | None:
+        """Return what is committed when a request is made; None if the policy is told nothing.
+
+        A request that says nothing of it is one at which nothing is.
+        """
+        says = any(request.get(key) is not None for key in (COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY))
+        if self.chunk_shape is None:
+            if not says:
+                return None
+            raise RequestError(
+                f"'{COMMITTED_ACTIONS_KEY}': the policy's chunks do not join what is committed. Start the "
+                "server with --chunking-mode, or leave it out."
+            )
+        if not says:
+            return CommittedActions(actions=np.zeros((0, self.chunk_shape[1]), dtype=np.float32), n_frozen=0)
+        return _read_committed(request, self.chunk_shape)
 
     def _read_state(self, request: Mapping[str, Any]) -> dict[str, FloatArray]:
         layouts = {len(names): (kind, names) for kind, names in self.state_layouts.items()}
@@ -93,6 +112,7 @@ def observation_reader(policy: PolicySpec, env: EnvSpec, *, end_effector: bool) 
         cameras={name: CameraImage(CAMERA_WIRE_KEYS[name], *sizes[name]) for name in policy.cameras},
         states={name: dims[name] for name in policy.states},
         end_effector=end_effector,
+        chunk_shape=(policy.chunk_size, len(env.action.dims)) if policy.reads_committed else None,
     )
 
 
@@ -111,6 +131,21 @@ def _read_image(request: Mapping[str, Any], camera: CameraImage) -> ImageArray:
     if not isinstance(image, np.ndarray) or image.dtype != np.uint8 or image.shape != shape:
         raise RequestError(f"'{camera.key}': expected {expected}; found {_described(image)}.")
     return image
+
+
+def _read_committed(request: Mapping[str, Any], chunk_shape: tuple[int, int]) -> CommittedActions:
+    n_rows, n_dims = chunk_shape
+    expected = f"an array (N, {n_dims}), float32, all finite, of at most {n_rows} rows"
+    actions = _required(request, COMMITTED_ACTIONS_KEY, expected)
+    is_array = isinstance(actions, np.ndarray) and actions.dtype == np.float32 and actions.ndim == 2
+    fits = is_array and actions.shape[1] == n_dims and len(actions) <= n_rows
+    if not fits or not np.isfinite(actions).all():
+        raise RequestError(f"'{COMMITTED_ACTIONS_KEY}': expected {expected}; found {_described(actions)}.")
+    numbers = f"a number from 0 to {len(actions)}, the rows of '{COMMITTED_ACTIONS_KEY}'"
+    n_frozen = _required(request, COMMITTED_FROZEN_KEY, numbers)
+    if not isinstance(n_frozen, int) or isinstance(n_frozen, bool) or not 0 <= n_frozen <= len(actions):
+        raise RequestError(f"'{COMMITTED_FROZEN_KEY}': expected {numbers}; found {shown(n_frozen)}.")
+    return CommittedActions(actions=actions.copy(), n_frozen=n_frozen)
 
 
 def _required(request: Mapping[str, Any], key: str, expected: str) -> Any:

@@ -140,9 +140,10 @@ class SessionTable:
 
     def window(self, session: Session, request: Mapping[str, Any]) -> ObservationWindow:
         """Return what the policy is given for an inference: the unread frames, and the one of the request."""
+        committed = self._reader.read_committed(request)
         newest = self._reader.read(request, step=self._next_step(session, request))
         frames, session.frames = (*session.frames, newest), []
-        return ObservationWindow(slot=session.slot, frames=frames)
+        return ObservationWindow(slot=session.slot, frames=frames, committed=committed)
 
     def drop_connection(self, connection: int) -> None:
         """Drop the sessions of a connection that has ended."""

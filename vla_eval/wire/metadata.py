@@ -14,6 +14,9 @@ from vla_eval.strict.json_text import shown
 
 PROTOCOL = "openpi+1"
 SUPPORTS = ("reset", "observe", "seed", "row")
+COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY = "committed/actions", "committed/n_frozen"
+"""Of an `infer`: what is left of the chunk under way, (N, A) float32, and how many of its rows are frozen,
+see `CommittedActions`. No published server has such keys: openpi's and LeRobot's take none over a socket."""
 NOT_COMPARED = ("n_sessions", "training_seeds", "sentences")
 
 MAX_ACTIONS = 10_000  # of one reply
@@ -59,6 +62,8 @@ class ServerMetadata:
     needs_every_frame: bool | None = None  # whether the policy must see each control step
     needs_session_id: bool | None = None  # whether requests must name their session
     batch_max: int | None = None  # rows of a shared pass; see `EpisodeStart.row`
+    # the mode (`chunking.mode`) in which its chunks join what a request says is committed; None: they do not
+    chunking_mode: str | None = None
     supports: tuple[str, ...] = ()  # which of `reset`, `observe`, `seed` and `row` may be sent
     versions: Mapping[str, str] | None = None  # package -> version, at the server
     n_sessions: int | None = None
@@ -86,7 +91,8 @@ class ServerMetadata:
     def to_wire(self) -> dict[str, Any]:
         """Return the first message of a server of this wire."""
         left_out = {"weights_known", "other"}
-        left_out |= {name for name in ("training_seeds", "sentences") if getattr(self, name) is None}
+        unsaid = ("training_seeds", "sentences", "chunking_mode")
+        left_out |= {name for name in unsaid if getattr(self, name) is None}
         if not self.weights_known:
             left_out.add("weights_sha256")
         names = [one.name for one in fields(self) if one.name not in left_out]
@@ -224,6 +230,7 @@ _READERS = {
     "needs_every_frame": _Reader("true or false", _flag),
     "needs_session_id": _Reader("true or false", _flag),
     "batch_max": _Reader(f"a number from 1 to {MAX_SERVER_ROWS}", _count(1, MAX_SERVER_ROWS)),
+    "chunking_mode": _Reader("text", _text),
     "supports": _Reader("a list of names", _names),
     "versions": _Reader("a map of texts", _map_of(lambda value: value if isinstance(value, str) else None)),
     "n_sessions": _Reader("a number ≥ 0", _count(0, MAX_COUNT)),

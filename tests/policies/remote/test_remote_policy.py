@@ -38,13 +38,18 @@ def make_env(n_slots: int = 1, cameras: tuple[str, ...] = ()) -> FakeEnv:
 
 @contextlib.contextmanager
 def remote(
-    server: SmallServer, *, n_action_steps: int = 1, n_slots: int = 1, **args: Any
+    server: SmallServer,
+    *,
+    n_action_steps: int = 1,
+    n_slots: int = 1,
+    chunking: ChunkingSettings = ChunkingSettings(),  # noqa: B008  # frozen
+    **args: Any,
 ) -> Iterator[RemotePolicy]:
     """A policy at this server."""
     context = PolicyContext(
         name="remote",
         env=make_env().spec,
-        chunking=ChunkingSettings().at(n_action_steps),
+        chunking=chunking.at(n_action_steps),
         n_candidates=3,
         n_slots=n_slots,
     )

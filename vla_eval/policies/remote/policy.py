@@ -7,6 +7,7 @@ from typing import Any  # Any: what a recipe holds, and what a server sends
 
 import numpy as np
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.files import digest_of
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import RemoteChangedError, SpecMismatchError
@@ -19,6 +20,7 @@ from vla_eval.policies.remote.settings import RemoteSettings, remote_settings
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.wire.addresses import split_urls
 from vla_eval.wire.client import PolicyClient
+from vla_eval.wire.metadata import COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY, ServerMetadata
 
 SESSION_BYTES = 8
 
@@ -67,7 +69,11 @@ class RemotePolicy:
             instruction = self._instructions[window.slot]
             for frame in earlier:
                 client.observe(session, self._fit.request(frame, instruction), step=frame.step)
-            client.ask_infer(session, self._fit.request(last, instruction), step=last.step)
+            request = self._fit.request(last, instruction)
+            if window.committed is not None and len(window.committed.actions):
+                request[COMMITTED_ACTIONS_KEY] = window.committed.actions
+                request[COMMITTED_FROZEN_KEY] = window.committed.n_frozen
+            client.ask_infer(session, request, step=last.step)
         return [self._answer(window.slot) for window in windows]
 
     def close(self) -> None:
@@ -114,6 +120,7 @@ def make_remote(
                 f"{where}: the policy must see each control step, and the server takes no frames between "
                 f"inferences. Use --n-action-steps 1."
             )
+        _check_mode(context.chunking, metadata, where=where)
         for slot in range(1, context.n_slots):
             shared = client.client.shares_connection
             clients[slot] = client.client if shared else client.another(settings)
@@ -127,5 +134,23 @@ def make_remote(
         cameras=tuple(fitted.cameras),
         states=fitted.states,
         chunk_size=fitted.chunk_size,
+        reads_committed=metadata.chunking_mode is not None,
     )
     return RemotePolicy(spec=spec, clients=clients, fit=fitted, settings=settings, action=context.env.action)
+
+
+def _check_mode(chunking: ChunkingSpec, server: ServerMetadata, *, where: str) -> None:
+    """Refuse a server whose chunks do not join as the evaluation asks, or that joins where none is asked."""
+    wanted = chunking.mode if chunking.execution.commits else None
+    if server.chunking_mode == wanted:
+        return
+    if wanted is None:
+        raise SpecMismatchError(
+            f"{where}: the server's chunks join what is committed ({server.chunking_mode}), and "
+            f"the evaluation's mode is {chunking.mode}. Start it without --chunking-mode, or evaluate with "
+            f"--set chunking.mode={server.chunking_mode}."
+        )
+    raise SpecMismatchError(
+        f"{where}: chunking.mode={wanted} asks for chunks that join what is committed; the server's mode is "
+        f"{server.chunking_mode or 'none of these'}. Start it with --chunking-mode {wanted}."
+    )
