@@ -8,7 +8,10 @@ from vla_eval.checkpoints.files import CONFIG_FILE, read_json
 from vla_eval.checkpoints.notes import COMPILE, checkpoint_folder
 from vla_eval.chunking import ChunkingSpec
 
-RTC = "real-time chunking is of LeRobot's rollouts; here a chunk does not depend on the one before"
+RTC = (
+    "whether chunks join is what the evaluation says. Guided as LeRobot does it: --set chunking.mode=rtc, "
+    "with the fields of chunking.rtc"
+)
 DRAWS = "an inference's draws depend on task, seed, run and control step"
 
 
@@ -29,7 +32,7 @@ EXECUTION_FIELDS: Mapping[str, Answer] = {
         "chunking.mode=temporal_ensemble --set chunking.ensemble_decay={value}"
     ),
     "rtc_config": Answer(instead=RTC),
-    "rtc_ramp_rate": Answer(instead=RTC),
+    "rtc_ramp_rate": Answer(instead="real-time chunking of this type is of its own kind, and not done here"),
     "per_episode_seed": Answer(instead=DRAWS, off=False),
     "eval_seed": Answer(instead=DRAWS),
     "compile_model": Answer(
