@@ -12,7 +12,7 @@ import pytest
 from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.errors import RecipeError
-from vla_eval.probe.grid import GridSettings, GridWorld, plan_grid
+from vla_eval.probe.grid import Axis, GridSettings, GridWorld, plan_grid
 from vla_eval.probe.grid_table import grid_table
 from vla_eval.probe.grid_text import grid_notes, grid_sentences, render_grid
 from vla_eval.probe.phases import fixed_phases, inferences
@@ -144,7 +144,7 @@ def record(policy: str, k: int, seed: int, *, is_success: bool, n_frames: int) -
     )
 
 
-def grid_of(counts: dict[str, tuple[int, int]], *, reads_every: bool = False) -> Any:
+def grid_of(counts: dict[str, tuple[int, int]], *, reads_every: bool = False, axis: Axis = "delay") -> Any:
     """A grid of K = 1 and K = 4: policy -> successes in 40 episodes at each."""
     found: list[EpisodeRecord] = []
     for policy, of_each in counts.items():
@@ -152,9 +152,7 @@ def grid_of(counts: dict[str, tuple[int, int]], *, reads_every: bool = False) ->
             n_frames = 57 if reads_every and policy == "p" else 60 // k
             found += [record(policy, k, seed, is_success=seed < n, n_frames=n_frames) for seed in range(40)]
     phases = fixed_phases(task_spec(TASK), {})
-    world = GridWorld(
-        task=TASK, axis="delay", level=5, first_inference_step=0, phases=phases, config=config()
-    )
+    world = GridWorld(task=TASK, axis=axis, level=5, first_inference_step=0, phases=phases, config=config())
     return grid_table([world], [found])
 
 
@@ -171,6 +169,71 @@ def test_a_drop_is_one_of_chunk_and_phase_if_an_oracle_of_the_same_inferences_fa
     (sentence,) = grid_sentences(grid_of({"p": (40, 1), "cue_reader": (40, 14)}))
     assert "explain a part of the drop, not all of it" in sentence
     assert grid_sentences(grid_of({"p": (40, 38), "cue_reader": (40, 14)})) == []  # no drop to explain
+
+
+def test_a_drop_by_slow_inferences_is_one_of_motion_or_of_missed_frames_of_the_cue() -> None:
+    (sentence,) = grid_sentences(
+        grid_of({"p": (40, 13), "cue_reader": (40, 14), "oracle": (40, 40)}, axis="latency")
+    )
+    assert "at K = 4, inference 5, receding_horizon, and in 1.00 at K = 1" in sentence
+    assert "cue_reader, which has the same inferences, falls, too, from 1.00 to 0.35" in sentence
+    assert "frames of the cue that no inference fell into explain the drop, not motion" in sentence
+
+    of_motion = grid_of({"p": (40, 13), "cue_reader": (40, 14), "oracle": (40, 14)}, axis="latency")
+    (sentence,) = grid_sentences(of_motion)
+    assert "oracle, which knows all, falls, too, from 1.00 to 0.35: slow inferences cost motion" in sentence
+    neither = grid_of({"p": (40, 13), "cue_reader": (40, 40), "oracle": (40, 40)}, axis="latency")
+    (sentence,) = grid_sentences(neither)
+    assert "neither motion nor missed frames of the cue explain the drop" in sentence
+
+
+class TestLatency:
+    SETTINGS = GridSettings(axes=("latency",), latencies=(0, 2), modes=("receding_horizon", "wait"))
+
+    def test_each_latency_is_run_in_each_mode_at_every_first_inference(self) -> None:
+        grid = plan_grid(config(n_action_steps=(1, 2)), self.SETTINGS)
+
+        found = [
+            (w.chunking.mode, w.level, w.first_inference_step, w.config.n_action_steps) for w in grid.worlds
+        ]
+        assert found == [
+            (mode, level, first, sizes)
+            for mode in ("receding_horizon", "wait")
+            for level in (0, 2)
+            for first, sizes in ((0, (1, 2)), (1, (2,)))
+        ]
+        assert all(world.config.chunking == world.chunking for world in grid.worlds)
+        assert [world.chunking.delay for world in grid.worlds] == [world.level for world in grid.worlds]
+        assert len({world.config.name for world in grid.worlds}) == 8
+
+    def test_what_chunks_are_too_short_for_is_left_out_and_said(self) -> None:
+        grid = plan_grid(config(n_action_steps=(2, 4)), self.SETTINGS, chunk_size=4)
+
+        sizes = {(w.chunking.mode, w.level): w.config.n_action_steps for w in grid.worlds[:]}
+        assert sizes["receding_horizon", 2] == (2,)  # 4 + 2 actions are more than 4
+        assert sizes["wait", 2] == (4,)  # the last first inference; a chunk waits for nothing
+        assert grid.left_out == (
+            f"{TASK}: K = 4 with a latency of 2 (receding_horizon): chunks have 4 actions",
+        )
+
+    def test_a_task_without_phases_has_one_too(self) -> None:
+        grid = plan_grid(config(tasks=("TakeItBack-v0",), n_action_steps=(4,)), self.SETTINGS)
+
+        assert [world.first_inference_step for world in grid.worlds] == [0] * 4
+        assert grid.worlds[0].config.policies == ("hold", "oracle")
+
+    def test_slower_inferences_see_less_of_the_cue_and_answer_later(self) -> None:
+        worlds = plan_grid(config(n_action_steps=(2,)), self.SETTINGS).worlds
+        found = grid_table(
+            [w for w in worlds if w.first_inference_step == 0 and w.chunking.mode == "wait"],
+            [[record("p", 2, 1, is_success=True, n_frames=30)]] * 2,
+        )
+        parts = {cell.level: cell.parts[0].inferences for cell in found.cells}
+
+        # The cue has steps 0 to 4, the response begins at step 10. Every 2 steps: 0, 2, 4, and 10.
+        assert parts[0] == ((0, 2, 4), 0)
+        # Every 2 + 2 steps, since the arm waits: 0, 4, then 12, whose chunk arrives at step 14.
+        assert parts[2] == ((0, 4), 4)
 
 
 def test_a_grid_has_the_formats_of_other_tables() -> None:

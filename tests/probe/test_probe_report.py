@@ -103,7 +103,7 @@ def test_worlds_are_found_by_what_their_files_state_whatever_they_are_called() -
         ("mask", "cue"),
     ]
     (grid,) = found.grid
-    assert grid.world.place == (TASK, "cue", 7, 2)
+    assert grid.world.place == (TASK, "cue", 7, 2, "receding_horizon")
 
 
 @pytest.mark.parametrize(

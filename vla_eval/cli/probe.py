@@ -65,7 +65,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--grid",
         action="store_true",
         help="each --n-action-steps (1 2 4 8) with each --delay (0 5 20 80); with --probe cue or delay,cue: "
-        "with each --cue (1 2 3 5)",
+        "with each --cue (1 2 3 5); with --probe latency: with each --latency, in each --mode",
     )
     parser.add_argument("--no-controls", action="store_true", help="run only the policies that are named")
 
@@ -87,6 +87,8 @@ INTERVENTIONS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
         *("reset_steps", int, "S"),
         "control steps (the end of the cue, the beginning of the response)",
     ),
+    "--latency": ("latencies", int, "L", "of a grid: control steps of an inference (0 1 2 4 8)"),
+    "--mode": ("modes", str, "M", "of a grid of latencies: chunking.mode (receding_horizon wait)"),
     "--first-inference": (
         *("first_inferences", int, "S"),
         "of a grid: control steps of the first inference (all below K if K does not divide the phases)",
@@ -95,10 +97,11 @@ INTERVENTIONS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
 """Flag -> name, type and metavar of its value, and its help."""
 LEAST = {
     **{"swaps": 1, "delays": 0, "cues": 1, "lates": 1, "distractors": 1, "reset_steps": 1},
-    "first_inferences": 0,
+    **{"first_inferences": 0, "latencies": 0},
 }
 """Least number of the flags that take numbers."""
-OF_GRIDS = ("probes", "delays", "cues", "first_inferences")
+OF_GRIDS_ALONE = ("latencies", "modes", "first_inferences")
+OF_GRIDS = ("probes", "delays", "cues", *OF_GRIDS_ALONE)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -107,8 +110,9 @@ def run(args: argparse.Namespace) -> int:
 
     if args.grid:
         return _run_grid(args)
-    if args.first_inferences is not None:
-        raise RecipeError("--first-inference is of a grid. Add --grid.")
+    for flag, (name, *_) in INTERVENTIONS.items():
+        if name in OF_GRIDS_ALONE and getattr(args, name) is not None:
+            raise RecipeError(f"{flag} is of a grid. Add --grid.")
     probe = plan_probe(_config(args), _settings(args))
     for pair in probe.left_out:
         print(f"left out: {pair}", file=sys.stderr)
@@ -137,7 +141,7 @@ def probe_settings(chosen: Mapping[str, Any], *, controls: bool) -> "ProbeSettin
     from vla_eval.probe.interventions import INTERVENTIONS
     from vla_eval.probe.worlds import APPEARANCES, MASKS, ProbeSettings
 
-    numbers = {name: chosen.get(name) for name in LEAST if name != "first_inferences"}
+    numbers = {name: chosen.get(name) for name in LEAST if name not in OF_GRIDS_ALONE}
     settings: dict[str, Any] = {  # Any: tuples of words or numbers
         name: _numbers(values, name) for name, values in numbers.items()
     }
@@ -154,6 +158,7 @@ def probe_settings(chosen: Mapping[str, Any], *, controls: bool) -> "ProbeSettin
 
 
 def _grid_settings(args: argparse.Namespace) -> "GridSettings":
+    from vla_eval.chunking import EXECUTIONS
     from vla_eval.probe.grid import AXES, GridSettings
 
     words = [word for words in args.probes or () for word in words]
@@ -167,10 +172,13 @@ def _grid_settings(args: argparse.Namespace) -> "GridSettings":
     ]
     if others:
         raise RecipeError(f"--grid has no {', '.join(others)}. Run it without --grid.")
-    given = {name: _numbers(getattr(args, name), name) for name in ("delays", "cues", "first_inferences")}
+    numbers = ("delays", "cues", "latencies", "first_inferences")
+    given = {name: _numbers(getattr(args, name), name) for name in numbers}
     chosen: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
     if words:
         chosen["axes"] = tuple(dict.fromkeys(words))
+    if args.modes is not None:
+        chosen["modes"] = _names(args.modes, EXECUTIONS, kind="chunking mode", flag="--mode")
     return GridSettings(**chosen, controls=not args.no_controls)
 
 
@@ -199,7 +207,8 @@ def _run_grid(args: argparse.Namespace) -> int:
     from vla_eval.probe.grid_text import render_grid
     from vla_eval.probe.page.heat_maps import write_heat_maps
 
-    grid = plan_grid(_config(args), _grid_settings(args))
+    config = _config(args)
+    grid = plan_grid(config, _grid_settings(args), chunk_size=_shortest_chunk(config))
     for task in grid.left_out:
         print(f"left out: {task}", file=sys.stderr)
     print(f"{len(grid.worlds)} run folders, {grid.n_episodes} episodes", file=sys.stderr)
@@ -212,6 +221,21 @@ def _run_grid(args: argparse.Namespace) -> int:
     for path in write_heat_maps(table, args.out):
         print(f"Heat map: {path}", file=sys.stderr)
     return EXIT_EPISODE_ERRORS if table.n_errors else 0
+
+
+def _shortest_chunk(config: EvalConfig) -> int | None:
+    """Return how many actions the shortest chunk of the policies has; None where none is known."""
+    from vla_eval.checkpoints.notes import known_chunk_size
+    from vla_eval.policies.entries import load_policy_entries
+
+    known = [
+        policy.server.chunk_size
+        if policy.server is not None
+        else known_chunk_size(recipe.value.adapter, recipe.value.args, recipe=recipe.name)
+        for policy in load_policy_entries(config.policies)
+        for recipe in policy.recipes
+    ]
+    return min((size for size in known if size is not None), default=None)
 
 
 def _run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | None:

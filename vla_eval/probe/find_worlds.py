@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.config.evaluation import EvalConfig, ProbedWorld
+from vla_eval.config.recorded_chunking import read_chunking
 from vla_eval.errors import check_names
 from vla_eval.probe.choice_pairs import ChoicePairs, choice_pairs
 from vla_eval.probe.grid import AXES, GridWorld, named_grid_world
@@ -110,12 +111,14 @@ def _world(run: StoredRun) -> World | GridWorld | None:
         check_names("intervention", [stated.change], (AS_DRAWN, *INTERVENTIONS), where=where)
         return World(task=tasks[0], intervention=stated.change, level=stated.level, config=config)
     check_names("axis", [stated.change], AXES, where=where)
+    section, spec = run.description.config.get("chunking"), task_spec(tasks[0])
     return GridWorld(
         task=tasks[0],
-        axis="delay" if stated.change == "delay" else "cue",
+        axis=next(axis for axis in AXES if axis == stated.change),
         level=int(stated.level or 0),
         first_inference_step=stated.first_inference_step,
-        phases=fixed_phases(task_spec(tasks[0]), config.env),
+        phases=None if spec.candidates is None else fixed_phases(spec, config.env),
+        chunking=read_chunking(section if isinstance(section, dict) else {}, where=str(run.path)),
         config=config,
     )
 

@@ -33,10 +33,11 @@ class GridPart:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridCell:
-    """One policy at one K with one length of a phase."""
+    """One policy at one K with one length of a phase, or of an inference in one mode."""
 
     task: str
     axis: Axis
+    mode: str  # `chunking.mode`
     level: int
     policy: str
     n_action_steps: int
@@ -67,7 +68,7 @@ class GridCell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GridTable:
-    """All cells: by task, phase and policy, then by K and length."""
+    """All cells: by task, phase or mode, and policy, then by K and length."""
 
     cells: tuple[GridCell, ...]
 
@@ -78,8 +79,14 @@ class GridTable:
 
     def reference_of(self, cell: GridCell) -> GridCell | None:
         """Return the cell of the reference at the same K and length; None without one."""
-        key = (cell.task, cell.axis, cell.level, cell.reference, cell.n_action_steps)
-        keys = ((one.task, one.axis, one.level, one.policy, one.n_action_steps) for one in self.cells)
+        return None if cell.reference is None else self.of_policy(cell.reference, cell)
+
+    def of_policy(self, policy: str, cell: GridCell) -> GridCell | None:
+        """Return the cell of another policy at the same K and length; None without one."""
+        key = (cell.task, cell.axis, cell.mode, cell.level, policy, cell.n_action_steps)
+        keys = (
+            (one.task, one.axis, one.mode, one.level, one.policy, one.n_action_steps) for one in self.cells
+        )
         return next((one for one, own in zip(self.cells, keys, strict=True) if own == key), None)
 
 
@@ -90,9 +97,10 @@ def read_grid(worlds: Sequence[GridWorld], out: Path) -> GridTable:
 
 def grid_table(worlds: Sequence[GridWorld], records: Sequence[Sequence[EpisodeRecord]]) -> GridTable:
     """Return the table of these worlds, each with its records in any order."""
-    found: dict[tuple[str, Axis], list[_Run]] = {}
+    found: dict[tuple[str, Axis, str], list[_Run]] = {}
     for world, own in zip(worlds, records, strict=True):
-        found.setdefault((world.task, world.axis), []).append((world, by_policy(own)))
+        group = (world.task, world.axis, world.chunking.mode)
+        found.setdefault(group, []).append((world, by_policy(own)))
     return GridTable(cells=tuple(cell for runs in found.values() for cell in _cells(runs)))
 
 
@@ -129,10 +137,11 @@ def _cell(
     return GridCell(
         task=world.task,
         axis=world.axis,
+        mode=world.chunking.mode,
         level=world.level,
         policy=policy,
         n_action_steps=k,
-        n_cue_frames=world.phases.n_in_turn * world.phases.cue_steps,
+        n_cue_frames=_n_cue_frames(world),
         parts=tuple(_part(one, found[policy, k], k, reads_every) for one, found in runs),
         n_seeds=len({(record.run, record.seed) for record in results}),
         chance=chances.pop() if len(chances) == 1 else None,
@@ -142,8 +151,7 @@ def _cell(
 
 def _part(world: GridWorld, records: Sequence[EpisodeRecord], k: int, reads_every: bool | None) -> GridPart:
     results = results_of(records)
-    found = inferences(world.phases, k, first_inference_step=world.first_inference_step)
-    n_frames = world.phases.n_in_turn * world.phases.cue_steps
+    found, n_frames = _inferences(world, k), _n_cue_frames(world)
     return GridPart(
         first_inference_step=world.first_inference_step,
         inferences=found,
@@ -151,4 +159,21 @@ def _part(world: GridWorld, records: Sequence[EpisodeRecord], k: int, reads_ever
         success=Share.of_records(results, lambda record: bool(record.success_once)),
         followed=Share.of_records(results, follows),
         n_errors=len(records) - len(results),
+    )
+
+
+def _n_cue_frames(world: GridWorld) -> int:
+    return 0 if world.phases is None else world.phases.n_in_turn * world.phases.cue_steps
+
+
+def _inferences(world: GridWorld, k: int) -> Inferences:
+    """Return which inferences fall into the cue; none for a task without phases."""
+    interval = world.chunking.at(k).interval_steps
+    if world.phases is None or interval is None:
+        return Inferences(cue_steps=(), n_late=0)
+    return inferences(
+        world.phases,
+        interval,
+        first_inference_step=world.first_inference_step,
+        delay_steps=world.level if world.axis == "latency" else 0,
     )

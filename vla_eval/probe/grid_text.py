@@ -3,6 +3,7 @@
 import json
 from collections.abc import Sequence
 
+from vla_eval.probe.grid import AXES, CONTROLS, CUE_READER, ORACLE
 from vla_eval.probe.grid_table import GridCell, GridPart, GridTable
 from vla_eval.probe.text_table import JsonRow, error_notes, rows_as_csv, shown_rate, success_json
 from vla_eval.results.formats import Format
@@ -34,7 +35,7 @@ def printed_grid(table: GridTable) -> PrintedTable:
         Column("task", lambda cell: cell.task, is_number=False, folds=True),
         Column("policy", lambda cell: cell.policy, is_number=False, folds=True),
         Column("K", lambda cell: str(cell.n_action_steps)),
-        Column("length", lambda cell: f"{cell.axis} {cell.level}", is_number=False),
+        Column("length", _length, is_number=False),
         Column("first inference", lambda cell: _range([part.first_inference_step for part in cell.parts])),
         Column("inferences in the cue", lambda cell: _steps_of(cell.parts), is_number=False),
         Column("cue frames", _frames_seen),
@@ -71,6 +72,7 @@ def _key(cell: GridCell) -> JsonRow:
         "policy": cell.policy,
         "n_action_steps": cell.n_action_steps,
         "phase": cell.axis,
+        "mode": cell.mode,
         "length_steps": cell.level,
     }
 
@@ -109,9 +111,15 @@ def _flat(cell: GridCell, part: GridPart | None) -> JsonRow:
     return {**_key(cell), **own, "n_cue_frames": cell.n_cue_frames, "chance": cell.chance}
 
 
+def _length(cell: GridCell) -> str:
+    mode = f", {cell.mode}" if cell.axis == "latency" else ""
+    return f"{AXES[cell.axis]} {cell.level}{mode}"
+
+
 def _frames_seen(cell: GridCell) -> str:
     seen = _range([part.n_seen for part in cell.parts])
-    return UNDEFINED if seen == UNDEFINED else f"{seen} of {cell.n_cue_frames}"
+    is_known = seen != UNDEFINED and cell.n_cue_frames > 0
+    return f"{seen} of {cell.n_cue_frames}" if is_known else UNDEFINED
 
 
 def _spread(cell: GridCell) -> str:
@@ -141,10 +149,10 @@ def _steps_of(parts: Sequence[GridPart]) -> str:
 
 def grid_sentences(table: GridTable) -> list[str]:
     """Return a sentence for each cell in which a policy succeeds less than in its best cell."""
-    by_policy: dict[tuple[str, str, str], list[GridCell]] = {}
+    by_policy: dict[tuple[str, str, str, str], list[GridCell]] = {}
     for cell in table.cells:
         if cell.reference is not None and cell.rate is not None:
-            by_policy.setdefault((cell.task, cell.axis, cell.policy), []).append(cell)
+            by_policy.setdefault((cell.task, cell.axis, cell.mode, cell.policy), []).append(cell)
     found = []
     for cells in by_policy.values():
         best = max(cells, key=lambda cell: cell.rate or 0.0)
@@ -157,6 +165,8 @@ def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
     if not _is_below(cell, best) or now is None or at_best is None:
         return None
     drop = f"succeeds in {_rate(cell)} at {_where(cell)}, and in {_rate(best)} at {_where(best)}"
+    if cell.axis == "latency":
+        return f"{cell.policy} on {cell.task} {drop}; {_cause_of_latency(table, cell, best)}."
     rates = f"succeeds in {_rate(now)} and {_rate(at_best)}: chunk and phase"
     if not _is_below(now, at_best):
         said = f"{rates} do not explain the drop"
@@ -171,6 +181,23 @@ def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
     return f"{cell.policy} on {cell.task} {drop}; {same} {said}."
 
 
+def _cause_of_latency(table: GridTable, cell: GridCell, best: GridCell) -> str:
+    """Say whether slower inferences cost motion, or frames of the cue, by the controls that forget nothing."""
+    falls = {}
+    for control in CONTROLS:
+        now, at_best = table.of_policy(control, cell), table.of_policy(control, best)
+        if now is not None and at_best is not None and _is_below(now, at_best):
+            falls[control] = f"from {_rate(at_best)} to {_rate(now)}"
+    if ORACLE in falls:
+        return f"oracle, which knows all, falls, too, {falls[ORACLE]}: slow inferences cost motion"
+    if cell.reference == CUE_READER and CUE_READER in falls:
+        return (
+            f"cue_reader, which has the same inferences, falls, too, {falls[CUE_READER]}, and oracle does "
+            "not: the frames of the cue that no inference fell into explain the drop, not motion"
+        )
+    return "no control falls there: neither motion nor missed frames of the cue explain the drop"
+
+
 def _is_below(one: GridCell, other: GridCell) -> bool:
     """Whether the intervals of two rates do not overlap, and the first rate is the lower one."""
     if one.interval is None or other.interval is None:
@@ -179,7 +206,7 @@ def _is_below(one: GridCell, other: GridCell) -> bool:
 
 
 def _where(cell: GridCell) -> str:
-    return f"K = {cell.n_action_steps}, {cell.axis} {cell.level}"
+    return f"K = {cell.n_action_steps}, {_length(cell)}"
 
 
 def _rate(cell: GridCell) -> str:

@@ -100,10 +100,12 @@ class Inferences(NamedTuple):
     n_late: int  # steps of the response whose actions were predicted before it began
 
 
-def inferences(phases: Phases, n_action_steps: int, *, first_inference_step: int = 0) -> Inferences:
-    """Return the inferences, every n_action_steps, that matter to the cue and to the response."""
-    steps = range(first_inference_step, phases.cue_end_step, n_action_steps)
+def inferences(
+    phases: Phases, interval_steps: int, *, first_inference_step: int = 0, delay_steps: int = 0
+) -> Inferences:
+    """Return the inferences, one per interval, that matter to the cue and to the response."""
+    steps = range(first_inference_step, phases.cue_end_step, interval_steps)
     return Inferences(
         cue_steps=tuple(step for step in steps if phases.shows_at(step)),
-        n_late=(first_inference_step - phases.response_step) % n_action_steps,
+        n_late=(first_inference_step - phases.response_step) % interval_steps + delay_steps,
     )

@@ -24,8 +24,8 @@ from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import BatchPolicy, Policy
-from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.episode_log import check_reads_committed
+from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.policies.compiled import Compilation, CompiledPolicy
 from vla_eval.policies.context import PolicyContext
