@@ -37,6 +37,12 @@ one --task (or a --protocol) and one --policy. Flags go on top of the file, --se
 command again resumes where it stopped, and retries episodes that ended in an error."""
 EPILOG = """exit codes: 0 every episode has a result; 1 a mistake (see the message); 3 some episodes ended in
 an error (the same command retries them); 130, 143 stopped by Ctrl-C, SIGTERM."""
+CAPTURES = {
+    "video": "an mp4",
+    "rrd": "a file for the rerun viewer",
+    "strip": "a drawing of commands, the arm's way and borders of chunks",
+}
+"""What may be kept of an episode, by its field of `capture`."""
 RECIPE_FLAGS = (
     *("tasks", "policies", "protocol", "n_action_steps", "episodes", "seed_start", "runs", "workers"),
 )
@@ -57,12 +63,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--delay-trace", metavar="RUN", help="play the inference delays of another run (chunking.delay.trace)"
     )
     parser.add_argument("--suite", metavar="NAME", help="all tasks of a suite: `mikasa_base` …")
-    for kind, what in (("video", "an mp4"), ("rrd", "a file for the rerun viewer")):
+    for kind, what in CAPTURES.items():
         parser.add_argument(
             f"--capture-{kind}",
             metavar="WHICH",
             help=f"{what} of all|failures|successes episodes, or of the first N of each row (none)",
         )
+    for kind in ("video", "rrd"):
         add_old_flag(parser, f"--record-{kind}", f"--capture-{kind}")
     add_table_arguments(parser)
     parser.add_argument(
@@ -218,7 +225,7 @@ def _config(args: argparse.Namespace) -> EvalConfig:
             data["inference"] = "shared"
         if args.delay_trace is not None:
             set_field(EvalConfig, data, "chunking.delay", {"trace": args.delay_trace}, where="--delay-trace")
-        for kind in ("video", "rrd"):
+        for kind in CAPTURES:
             which = getattr(args, f"capture_{kind}")
             if which is not None:
                 flag = f"--capture-{kind}"

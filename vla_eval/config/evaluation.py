@@ -36,11 +36,13 @@ class CaptureConfig:
     # n_action_steps
     video: Which = "none"
     rrd: Which = "none"  # which episodes get a file for the rerun viewer, likewise
+    # which episodes get a drawing of commands, the arm's way and borders of chunks, likewise
+    strip: Which = "none"
     frame_stride: Steps = 2  # control steps from one frame to the next
 
     def __post_init__(self) -> None:
         check_bounds(self, prefix="capture.")
-        for name in ("video", "rrd"):
+        for name in ("video", "rrd", "strip"):
             which = getattr(self, name)
             if isinstance(which, int) and not 1 <= which <= MAX_EPISODES:
                 raise RecipeError(
@@ -51,10 +53,17 @@ class CaptureConfig:
     @property
     def is_on(self) -> bool:
         """Whether anything is captured."""
+        return self.needs_images or self.strip != "none"
+
+    @property
+    def needs_images(self) -> bool:
+        """Whether what is captured shows images."""
         return self.video != "none" or self.rrd != "none"
 
     def films_afterwards(self, sim_backend: str) -> bool:
         """Whether episodes run without images, and those wanted once more: the outcome alone decides."""
+        if not self.needs_images:
+            return True
         return sim_backend == "cpu" and {self.video, self.rrd} <= {"none", "failures", "successes"}
 
 

@@ -158,6 +158,7 @@ class EpisodeRunner:
                 tapes,
                 named,
                 env=env.spec,
+                chunking=group.rollout.chunking,
                 heartbeat=self._heartbeat,
                 film=lambda tape: tape if self._is_live(group) else self._filmed(tape, group),
             )

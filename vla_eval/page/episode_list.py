@@ -9,11 +9,11 @@ from urllib.parse import quote
 from markupsafe import Markup
 
 from vla_eval.page.material import Material
-from vla_eval.storage.capture_files import rrd_file, video_file
+from vla_eval.storage.capture_files import rrd_file, strip_file, video_file
 from vla_eval.tasks.objects.item_names import item_names
 
 OUTCOMES = ("success", "failure", "error")
-FIELDS = ("row", "run", "seed", "outcome", "step", "target", "chosen", "error", "video", "rrd")
+FIELDS = ("row", "run", "seed", "outcome", "step", "target", "chosen", "error", "video", "rrd", "strip")
 
 
 class EpisodeList(NamedTuple):
@@ -52,7 +52,7 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
                     [
                         *(number, record.run, record.seed, OUTCOMES.index(record.outcome)),
                         *(record.success_step, record.target, record.first_choice, error),
-                        *files.get(id(record), (None, None)),
+                        *files.get(id(record), (None, None, None)),
                     ]
                 )
     names = {"fields": FIELDS, "outcomes": OUTCOMES}
@@ -63,11 +63,15 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
 
 
 def _files(material: Material, folder: Path) -> dict[int, tuple[str | None, ...]]:
-    """Return the addresses, relative to the page, of video and rerun file of each record that has any."""
+    """Return the addresses, relative to the page, of video, rerun file and strip of each record."""
     found = {}
     for run in material.runs:
         for record in run.records:
-            places = (video_file(run.path, record), rrd_file(run.path, record))
+            places = (
+                video_file(run.path, record),
+                rrd_file(run.path, record),
+                strip_file(run.path, record),
+            )
             if any(place.is_file() for place in places):
                 found[id(record)] = tuple(
                     quote(os.path.relpath(one, folder)) if one.is_file() else None for one in places

@@ -182,7 +182,7 @@ def _sentence(table: GridTable, cell: GridCell, best: GridCell) -> str | None:
 
 
 def _cause_of_latency(table: GridTable, cell: GridCell, best: GridCell) -> str:
-    """Say whether slower inferences cost motion, or frames of the cue, by the controls that forget nothing."""
+    """Say whether slower inferences cost motion or frames of the cue, by controls that forget nothing."""
     falls = {}
     for control in CONTROLS:
         now, at_best = table.of_policy(control, cell), table.of_policy(control, best)

@@ -1,9 +1,9 @@
-"""What the video and the rerun file of an episode are called. An episode that was not captured has none."""
+"""What the files of an episode that was captured are called: video, rerun file, strip."""
 
 from pathlib import Path
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.folders import RRDS, VIDEOS
+from vla_eval.storage.folders import RRDS, STRIPS, VIDEOS
 
 
 def capture_stem(record: EpisodeRecord) -> str:
@@ -32,3 +32,8 @@ def stills_file(folder: Path, record: EpisodeRecord) -> Path:
 def rrd_file(folder: Path, record: EpisodeRecord) -> Path:
     """Return where the rerun file of an episode is, or would be."""
     return folder / RRDS / f"{capture_stem(record)}.rrd"
+
+
+def strip_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the drawing of how an episode was executed is, or would be."""
+    return folder / STRIPS / f"{capture_stem(record)}.svg"

@@ -5,11 +5,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.evaluation import CaptureConfig, is_wanted, may_be_wanted
 from vla_eval.core import EpisodeStart, Stage
 from vla_eval.records import EpisodeRecord
 from vla_eval.specs import EnvSpec
-from vla_eval.storage.capture_files import rrd_file, stills_file, thumbnail_file, video_file
+from vla_eval.storage.capture_files import rrd_file, stills_file, strip_file, thumbnail_file, video_file
 from vla_eval.viz.tape import EpisodeTape, Tapes
 
 
@@ -23,7 +24,9 @@ class EpisodeCapture:
 
     def load(self) -> None:
         """Import the writers while the worker is being set up: it takes seconds."""
-        for which, writer in ((self.config.video, "video"), (self.config.rrd, "rerun_log")):
+        config = self.config
+        writers = ((config.video, "video"), (config.rrd, "rerun_log"), (config.strip, "strip"))
+        for which, writer in writers:
             if which != "none":
                 importlib.import_module(f"vla_eval.viz.{writer}")
 
@@ -34,7 +37,7 @@ class EpisodeCapture:
             for start in starts
             if any(
                 may_be_wanted(which, run=start.run, index=start.seed - self.seed_start)
-                for which in (self.config.video, self.config.rrd)
+                for which in (self.config.video, self.config.rrd, self.config.strip)
             )
         }
         stride = self.config.frame_stride
@@ -47,6 +50,7 @@ class EpisodeCapture:
         records: Sequence[EpisodeRecord],
         *,
         env: EnvSpec,
+        chunking: ChunkingSpec,
         heartbeat: Callable[[Stage], None],
         film: Callable[[EpisodeTape], EpisodeTape],
     ) -> None:
@@ -54,11 +58,18 @@ class EpisodeCapture:
         for start, record in zip(starts, records, strict=True):
             tape = tapes.episodes.get(start.slot)
             index, is_success = record.seed - self.seed_start, record.outcome == "success"
-            for_video, for_rrd = (
+            for_video, for_rrd, for_strip = (
                 is_wanted(which, run=record.run, index=index, is_success=is_success)
-                for which in (self.config.video, self.config.rrd)
+                for which in (self.config.video, self.config.rrd, self.config.strip)
             )
-            if tape is None or not (for_video or for_rrd):
+            if tape is None:
+                continue
+            if for_strip:
+                from vla_eval.viz.strip import write_strip
+
+                heartbeat("step")
+                write_strip(tape, record, strip_file(self.folder, record), env=env, chunking=chunking)
+            if not (for_video or for_rrd):
                 continue
             tape = film(tape)
             if for_video:

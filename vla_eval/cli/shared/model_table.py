@@ -36,7 +36,8 @@ FINETUNE_FLAGS = (
 )
 EVAL_FLAGS = (
     *("protocol", "suite", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
-    *("seed_start", "runs", "overrides", "capture_video", "capture_rrd", "serve"),
+    *("seed_start", "runs", "overrides", "capture_video", "capture_rrd", "capture_strip"),
+    "serve",
 )
 """Flags that a table does not take, by the names of their values; `--task` and `--policy` choose a part."""
 

@@ -197,7 +197,7 @@ class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
         self._bar.write(
             f"{self._out}: {n_episodes} episodes, {n_finished} of them finished before; starting {workers}"
         )
-        if self._capture.is_on:
+        if self._capture.needs_images:
             sim_backend = plan.jobs[0].group.env.sim_backend
             self._bar.write(capture_cost(self._capture, sim_backend=sim_backend))
         self._n_done, self._n_total = n_finished, n_episodes

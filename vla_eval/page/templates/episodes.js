@@ -97,7 +97,7 @@
       if (other === one) tr.setAttribute("aria-selected", "true");
       const last = tr.insertCell();
       last.textContent = errorOf(other);
-      for (const kind of ["video", "rrd"]) {
+      for (const kind of ["video", "rrd", "strip"]) {
         if (other[at[kind]] === null) continue;
         const link = document.createElement("a");
         link.href = other[at[kind]];
