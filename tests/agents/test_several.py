@@ -91,3 +91,46 @@ def test_what_does_not_go_together_is_refused(
 def test_a_shard_of_one_training_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["train-agent", "--algorithm", "ppo", "--task", BIT, "--shard", "1/2"]) == 1
     assert "--shard is for several trainings" in capsys.readouterr().err
+
+
+def test_a_file_of_several_is_each_recipe_task_and_run_seed_and_flags_choose_among_them(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "table.yaml"
+    file.write_text(
+        "name: table\npolicies: [ppo_base, ppo_lstm_base]\nrun_seeds: [0, 1]\n"
+        "tasks: [mikasa_base/MemoryLengthEasy, mikasa_base/T-Maze]\n"
+        "train_agent: {n_envs: 2, steps: 32, save_every_steps: 16, network: {net_arch: [8]}, "
+        "arguments: {n_steps: 8, batch_size: 8}}\n"
+    )
+    out = tmp_path / "out"
+    flags = ["--task", BIT, "--policy", "ppo_base", "--out", str(out)]
+    assert main(["train-agent", str(file), *flags]) == 0
+    assert sorted(path.name for path in out.iterdir() if path.is_dir()) == [
+        f"ppo_base-mikasa_base-MemoryLengthEasy-v0-{seed}" for seed in (0, 1)
+    ]
+    capsys.readouterr()
+    assert main(["train-agent", str(file), "--dry-run"]) == 0
+    said = capsys.readouterr().out
+    assert "trainings: 8, of which 4 are described" in said
+    assert said.count("run folder:") == 4
+
+
+def test_a_file_of_trainings_is_not_evaluated(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", "base_table"]) == 1
+    assert "Run `mikasa-vla train-agent base_table`" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("field", ["policies", "tasks", "run_seeds"])
+@pytest.mark.parametrize("value", ["[]", "twice"])
+def test_a_file_of_none_or_of_one_twice_is_refused(
+    tmp_path: Path, field: str, value: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fields = {"policies": "[ppo_base]", "tasks": f"[{BIT}]", "run_seeds": "[0]"}
+    one = fields[field].strip("[]")
+    fields[field] = "[]" if value == "[]" else f"[{one}, {one}]"
+    file = tmp_path / "table.yaml"
+    file.write_text("\n".join(["name: t", *(f"{name}: {text}" for name, text in fields.items())]))
+
+    assert main(["train-agent", str(file)]) == 1
+    assert f"{field} is" in capsys.readouterr().err

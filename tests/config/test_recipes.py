@@ -9,6 +9,7 @@ import pytest
 from tests.config.eval_configs import MINIMAL, config
 from tests.evaluation.resolved import make_plan
 from vla_eval.config import files
+from vla_eval.config.agents import is_agent_table
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides, digest_of, find_recipe, list_recipes, load_recipe
 from vla_eval.config.policy import PolicyRecipe
@@ -160,7 +161,9 @@ class TestFinding:
         assert tables == [load_model_table(name).name for name in tables]
         papers = ["paper_offline_small", "paper_offline_table", "paper_vla_table"]
         assert tables == ["ablations", "memory_table", *papers]
-        for name in list_recipes("configs").keys() - set(tables):
+        trainings = {name for name in list_recipes("configs") if is_agent_table(name)}
+        assert trainings == {"base_table"}
+        for name in list_recipes("configs").keys() - {*tables, *trainings}:
             loaded = load_recipe("configs", name, EvalConfig).value
             assert loaded.name == name
             assert make_plan(loaded).jobs
@@ -218,7 +221,7 @@ class TestBounds:
             ({"workers": 10**6}, "workers is 1000000, expected a number ≤ 1,024"),
             ({"slots_per_worker": 10**9}, "slots_per_worker is 1000000000"),
             ({"n_action_steps": [10**9]}, r"chunking\.n_action_steps is 1000000000"),
-            ({"chunking": {"delay_steps": 10**9}}, r"chunking\.delay_steps is 1000000000"),
+            ({"chunking": {"delay_steps": 10**9}}, r"chunking\.delay is 1000000000"),
             ({"timeouts": {"step_seconds": 1e300}}, r"timeouts\.step_seconds is 1e\+300"),
             ({"capture": {"video": 10**9}}, r"capture\.video is 1000000000"),
             ({"capture": {"frame_stride": 10**9}}, r"capture\.frame_stride is 1000000000"),

@@ -19,6 +19,7 @@ from vla_eval.cli.shared.arguments import (
 )
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.cli.shared.output import add_table_arguments
+from vla_eval.config.agents import is_agent_table
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.protocol import fill_from_protocol
@@ -146,6 +147,11 @@ def run(args: argparse.Namespace) -> int:
             from vla_eval.cli.shared.model_table import evaluate_table
 
             return evaluate_table(args)
+        if is_agent_table(args.config):
+            raise RecipeError(
+                f"{args.config:.200}: is of trainings. Run `mikasa-vla train-agent {args.config:.200}`; its "
+                "last line is the command that evaluates them."
+            )
     if args.tiny:
         raise RecipeError("--tiny is for a table of learned policies, such as configs/paper_vla_table.yaml.")
     config = _config(args)

@@ -8,6 +8,7 @@ from typing import get_args
 from vla_eval.base_tasks.catalog import base_task
 from vla_eval.checkpoints.bases import FIRST_TRAININGS
 from vla_eval.cli.terminal.screen import NARROWEST, filled, screen_width
+from vla_eval.config.agents import AgentTable, is_agent_table
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe
@@ -34,7 +35,7 @@ READY, TO_TRAIN, FROM_BASE = (
 REMOTE = "behind a socket: needs a server"
 FOR_TESTS, ADAPTERS = "for tests: tiny, with random weights", "adapters without a recipe of their own"
 TINY_SUFFIX = "_tiny"  # of the names of recipes for tests
-RecipeClass = type[EvalConfig | ModelTable | DatasetRecipe | Protocol | PromptRecipe]
+RecipeClass = type[EvalConfig | ModelTable | AgentTable | DatasetRecipe | Protocol | PromptRecipe]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -160,11 +161,17 @@ def _broken(name: str, exc: VlaEvalError) -> Row:
     return (name, f"CANNOT BE READ: {exc}")
 
 
+def _kind_of_config(name: str) -> RecipeClass:
+    if is_model_table(name):
+        return ModelTable
+    return AgentTable if is_agent_table(name) else EvalConfig
+
+
 _LISTS: dict[str, Callable[[], Groups]] = {
     "tasks": _tasks,
     "families": _families,
     "policies": _policies,
-    "configs": lambda: _recipes("configs", lambda name: ModelTable if is_model_table(name) else EvalConfig),
+    "configs": lambda: _recipes("configs", _kind_of_config),
     "prompts": lambda: _recipes("prompts", lambda _name: PromptRecipe),
     "datasets": lambda: _recipes("datasets", lambda _name: DatasetRecipe),
     "protocols": lambda: _recipes("protocols", lambda _name: Protocol),

@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import copy
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,7 +17,7 @@ from vla_eval.cli.shared.arguments import (
     task_argument,
     typed_command,
 )
-from vla_eval.config.agents import AgentConfig, AgentRecipe
+from vla_eval.config.agents import AgentConfig, AgentRecipe, AgentTable, is_agent_table
 from vla_eval.config.files import apply_overrides
 from vla_eval.errors import RecipeError
 from vla_eval.storage.folders import check_writable
@@ -30,7 +31,8 @@ DESCRIPTION = """Train an agent by rewards, without demonstrations: PPO, PPO-LST
 
 --algorithm takes the recipe of that name that fits the task; --policy NAME takes another one in policies/
 with a `train_agent` section, for example ppo_published. CONFIG is a file with fields `policy`, `task`,
-`out`, `run_seed`, `train_agent`, `held_out`. --set changes a field of the recipe's section
+`out`, `run_seed`, `train_agent`, `held_out`, or of several trainings, with `policies`, `tasks`,
+`run_seeds`, such as base_table. --set changes a field of the recipe's section
 (--set arguments.gamma=0.9). Several algorithms, tasks or run seeds are trained one after another (with
 --shard beside each other), and evaluated together. The same command again resumes it exactly, also after a
 kill, from the last checkpoint. Then: mikasa-vla eval --policy RUN --task TASK"""
@@ -135,8 +137,11 @@ def _run_several(args: argparse.Namespace, configs: list[AgentConfig], command: 
     placed = in_folders(configs, out)
     own = of_shard(placed, args.shard)
     if args.dry_run:
-        for one in own:
+        # Run seeds take as long as each other.
+        once = {(one.policy, one.task): one for one in reversed(own)}
+        for one in reversed(once.values()):
             _describe(one)
+        print(f"trainings: {len(own)}, of which {len(once)} are described, one per recipe and task")
         return 0
     for number, one in enumerate(own, 1):
         print(f"training {number} of {len(own)}: {one.out}", file=sys.stderr)
@@ -170,17 +175,35 @@ def _train(config: AgentConfig, *, command: str) -> "tuple[FinetuneSummary, Stop
 
 def _configs(args: argparse.Namespace) -> list[AgentConfig]:
     """Return a training for each recipe, task and run seed."""
-    named = args.algorithms or args.policies or [None]
+    table = _table(args.config)
+    named = args.algorithms or args.policies or ([None] if table is None else table.policies)
+    tasks = args.tasks or ([None] if table is None else table.tasks)
+    run_seeds = args.run_seeds or ([None] if table is None else table.run_seeds)
+    start = None if table is None else table.shared()
     return [
-        _config(args, name, task, run_seed)
+        _config(args, name, task, run_seed, start=start)
         for name in named
-        for task in args.tasks or [None]
-        for run_seed in args.run_seeds or [None]
+        for task in tasks
+        for run_seed in run_seeds
     ]
 
 
+def _table(name: str | None) -> AgentTable | None:
+    """Return the file if it is one of several trainings."""
+    from vla_eval.tasks.configured import read_configured
+
+    if name is None or not is_agent_table(name):
+        return None
+    return read_configured(AgentTable, name, folder="configs")
+
+
 def _config(
-    args: argparse.Namespace, name: str | None, task: str | None, run_seed: int | None
+    args: argparse.Namespace,
+    name: str | None,
+    task: str | None,
+    run_seed: int | None,
+    *,
+    start: dict[str, Any] | None,  # Any: plain data; what all trainings of a file have
 ) -> AgentConfig:
     def edit(data: dict[str, Any]) -> None:  # Any: plain data of YAML
         set_flags(data, args, ("device", "out", "workers"))
@@ -207,8 +230,8 @@ def _config(
         AgentConfig,
         edit,
         folder="configs",
-        name=args.config,
-        start={},
+        name=args.config if start is None else None,
+        start=copy.deepcopy(start or {}),
         asks="a configuration, or an algorithm and a task",
         needed={"task": "--task", "policy": "--algorithm"},
         example="train-agent --algorithm ppo_lstm --task mikasa_base/RepeatFirstEasy-v0",

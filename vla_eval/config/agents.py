@@ -1,11 +1,12 @@
 """The `train_agent` section of `policies/*.yaml`, and one training by rewards. Standard library only."""
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from vla_eval.config.environment import Simulator
+from vla_eval.config.files import recipe_fields
 from vla_eval.config.finetuning import HeldOutConfig
-from vla_eval.strict.bounds import Slots, TrainingSteps, Workers, check_bounds, check_seeds
+from vla_eval.strict.bounds import Slots, TrainingSteps, Workers, check_bounds, check_seeds, require
 from vla_eval.strict.devices import check_device
 
 Algorithm = Literal["ppo", "ppo_lstm", "sac"]
@@ -57,3 +58,35 @@ class AgentConfig:
         check_bounds(self)
         check_seeds(self.run_seed, name="run_seed")
         check_device(self.device)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentTable:
+    """Several trainings, as `mikasa-vla train-agent CONFIG` reads them: each recipe, task and run seed."""
+
+    name: str
+    policies: tuple[str, ...]  # recipes
+    tasks: tuple[str, ...]
+    description: str = ""
+    run_seeds: tuple[int, ...] = (0,)
+    # as in `AgentConfig`, for each of them
+    train_agent: dict[str, Any] = field(default_factory=dict)  # Any: decoded as an AgentRecipe
+    device: str = "auto"
+    workers: Workers = "auto"
+    held_out: HeldOutConfig | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+        for name in ("policies", "tasks", "run_seeds"):
+            found = getattr(self, name)
+            require(bool(found) and len(set(found)) == len(found), name, list(found), "some, none twice")
+
+    def shared(self) -> dict[str, Any]:  # Any: plain data of YAML
+        """Return what is the same in all trainings, as their configurations have it."""
+        same = {"train_agent": dict(self.train_agent), "device": self.device, "workers": self.workers}
+        return same if self.held_out is None else {**same, "held_out": asdict(self.held_out)}
+
+
+def is_agent_table(name: str) -> bool:
+    """Whether a configuration is of several trainings; errors are those of `recipe_fields`."""
+    return {"run_seeds", "rows"} & recipe_fields("configs", name) == {"run_seeds"}
