@@ -81,6 +81,12 @@ class TestTraces:
         assert trace.episodes == {}
         assert trace.pool == pool
 
+    def test_the_order_of_records_does_not_matter(self) -> None:
+        turned = dict(reversed(self.DELAYS.items()))
+
+        found = DelayTrace.narrowed(turned, task="C", policy="other", n_action_steps=4)
+        assert found.pool == self.narrowed("C", "other", 4).pool
+
 
 @pytest.mark.parametrize(
     ("given", "problem"),

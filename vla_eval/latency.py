@@ -88,7 +88,8 @@ class DelayTrace:
         """
         wanted = (policy, n_action_steps)
         alike = (
-            [steps for name, own in delays.items() if name[1 : 1 + n] == wanted[:n] for steps in own]
+            # Sorted: records stand in the order in which episodes ended.
+            sorted(steps for name, own in delays.items() if name[1 : 1 + n] == wanted[:n] for steps in own)
             for n in (2, 1, 0)
         )
         return cls(

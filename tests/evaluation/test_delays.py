@@ -116,6 +116,14 @@ class TestTraces:
         assert "drawn has 0 of these 2 episodes" in capsys.readouterr().err
 
 
+def test_it_is_said_where_a_measured_delay_is_that_of_several_episodes(pair: Bench) -> None:
+    def notes(**fields: Any) -> list[str]:
+        return make_plan(pair.config(chunking={"delay": "measured"}, **fields)).notes
+
+    assert notes() == []
+    assert "share passes" in " ".join(notes(slots_per_worker=2))
+
+
 def test_a_delay_that_is_a_number_is_recorded_as_before_it_could_vary(bench: Bench) -> None:
     """Else runs of earlier versions could not be continued."""
     old = bench.config(chunking={"delay_steps": 1})

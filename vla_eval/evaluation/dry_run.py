@@ -76,9 +76,7 @@ def evaluation_effort(
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)
     steps = [job.group.offered.horizon_steps for job in ahead]
-    inferences = [
-        math.ceil(n_steps / job.group.key.n_action_steps) for job, n_steps in zip(ahead, steps, strict=True)
-    ]
+    inferences = [math.ceil(n_steps / _interval(job)) for job, n_steps in zip(ahead, steps, strict=True)]
     reads = images_read(resolved.policies)
     rendered = [
         n_rendered(job, config, reads=reads[job.group.part], n_steps=n_steps)
@@ -160,12 +158,17 @@ def n_rendered(job: EpisodeJob, config: EvalConfig, *, reads: Reads, n_steps: in
         for_policy = n_steps
     elif reads == "last":
         kept = config.cue_view == "first_frame"  # the cue's first frame, which is shown again
-        for_policy = min(n_steps, math.ceil(n_steps / job.group.key.n_action_steps) + kept)
+        for_policy = min(n_steps, math.ceil(n_steps / _interval(job)) + kept)
     capture = config.capture
     index = job.seed - config.seed_start
     if not any(may_be_wanted(which, run=job.run, index=index) for which in (capture.video, capture.rrd)):
         return for_policy
     return min(n_steps + 1, for_policy + math.ceil((n_steps + 1) / capture.frame_stride))
+
+
+def _interval(job: EpisodeJob) -> int:
+    """Return the control steps between two inferences; where delays vary, at least as many."""
+    return job.group.rollout.chunking.interval_steps or job.group.key.n_action_steps
 
 
 def _read_by(policy: PolicyEntry) -> Reads:

@@ -36,6 +36,7 @@ from vla_eval.evaluation.plan_checks import (
     steps_of,
 )
 from vla_eval.evaluation.resolve import ResolvedEvaluation, has_weights
+from vla_eval.latency import MEASURED
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
@@ -99,7 +100,18 @@ class Plan:
         parts = dict.fromkeys(group.part for group in self._groups)
         unknown = [part for part in parts if part in self.sentences and self.sentences[part] is None]
         played = [] if self.delays is None else [self.delays.note([job.key for job in self.jobs])]
-        return [*(about_nothing_known(part) for part in unknown), *played]
+        return [*(about_nothing_known(part) for part in unknown), *played, *self.about_measured]
+
+    @property
+    def about_measured(self) -> list[str]:
+        """A note where measured delays are not those of an episode alone."""
+        measured = [group for group in self._groups if group.rollout.chunking.delay == MEASURED]
+        if not measured or (max(group.n_rows for group in measured) == 1 and not self.shared):
+            return []
+        return [
+            "chunking.delay is measured, and episodes share passes of the policy: the delay of each is that "
+            "of the whole pass. For that of a robot: workers=1, slots_per_worker=1, inference=in_process."
+        ]
 
     @property
     def _groups(self) -> list[EpisodeGroup]:
