@@ -23,7 +23,7 @@ from vla_eval.core import ActionChunk, CommittedActions, FloatArray
 from vla_eval.errors import RecipeError, SpecMismatchError
 from vla_eval.latency import Delay, EpisodeDelays, VaryingDelay, longest_steps, shortest_steps
 from vla_eval.strict.bounds import MAX_STEPS, Bounds, Steps, check_bounds
-from vla_eval.strict.decoding import formerly
+from vla_eval.strict.renamed import formerly
 
 Mode = Literal["receding_horizon", "temporal_ensemble", "wait", "rtc", "prefix"]
 
@@ -34,7 +34,7 @@ class Execution(NamedTuple):
     summary: str
     averages: bool = False  # the action of a step is the weighted mean of what all chunks say about it
     waits: bool = False  # the arm holds still during an inference; a chunk's first action is for its arrival
-    commits: bool = False  # the policy is told what will be executed before its chunk can arrive
+    commits: bool = False  # the policy gets what will be executed before its chunk can arrive
     is_guided: bool = False  # the new chunk is guided towards that, by `chunking.rtc`
 
 

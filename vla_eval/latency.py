@@ -1,4 +1,4 @@
-"""How many control steps an inference takes: a number, drawn, measured here, or played from another run.
+"""How many control steps an inference takes: a number, drawn, measured here, or replayed from another run.
 
 A simulated episode stands still while the policy thinks. The delay says how far a robot's clock would have
 gone meanwhile. Except where it is measured it is data: the same episode has the same delays on any machine.
@@ -12,7 +12,6 @@ from typing import Literal, Self
 import numpy as np
 
 from vla_eval.errors import RecipeError
-from vla_eval.seeding import Stream, generator
 from vla_eval.strict.bounds import MAX_STEPS, require
 
 MEASURED = "measured"
@@ -27,7 +26,7 @@ EpisodeName = tuple[str, str, int, int, int]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VaryingDelay:
-    """A delay that differs between inferences: drawn (`steps`, `p`), or played from a run (`trace`)."""
+    """A delay that differs between inferences: drawn (`steps`, `p`), or replayed from a run (`trace`)."""
 
     steps: tuple[int, ...] = ()  # control steps, one of which is drawn for each inference
     p: tuple[float, ...] = ()  # their probabilities; none: all alike
@@ -105,8 +104,8 @@ class EpisodeDelays:
     delay: Delay
     seed: int  # of the episode: what is drawn depends on it and on the inference's number alone
     control_hz: float
-    run: int = 0  # with the seed, the episode of the trace that is played
-    trace: DelayTrace | None = None  # where the delay is played
+    run: int = 0  # with the seed, the episode of the trace that is replayed
+    trace: DelayTrace | None = None  # where the delay is replayed
     steps: list[int] = field(default_factory=list)
     """Control steps of each inference so far."""
 
@@ -130,8 +129,11 @@ class EpisodeDelays:
             return min(math.ceil(seconds * self.control_hz), MAX_STEPS)
         index, options = len(self.steps), self.delay.steps
         if self.trace is not None:
-            played, options = self.trace.episodes.get((self.run, self.seed), ()), self.trace.pool
-            if index < len(played):
-                return played[index]
+            replayed, options = self.trace.episodes.get((self.run, self.seed), ()), self.trace.pool
+            if index < len(replayed):
+                return replayed[index]
+        # Here and not above: most episodes draw no delay, and numpy's generators take time to import.
+        from vla_eval.seeding import Stream, generator
+
         random = generator(self.seed, Stream.DELAY, index)
         return int(random.choice(np.array(options), p=self.delay.p or None))

@@ -44,7 +44,7 @@ class RolloutSettings:
     reset_policy_at_step: int | None = None
     # what the policy is given to see of the cue; observers get what was rendered
     cue_view: CueViewSettings = AS_SHOWN
-    delay_trace: DelayTrace | None = None  # the delays to play, where `chunking.delay` names a run
+    delay_trace: DelayTrace | None = None  # the delays to replay, where `chunking.delay` names a run
 
 
 class _Running(NamedTuple):

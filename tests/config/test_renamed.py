@@ -13,7 +13,8 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.errors import RecipeError
-from vla_eval.strict.decoding import decode, formerly, warn_renamed
+from vla_eval.strict.decoding import decode, warn_renamed
+from vla_eval.strict.renamed import formerly
 
 BASE = {"name": "x", "tasks": ["RememberColor3-v0"], "policies": ["oracle"]}
 

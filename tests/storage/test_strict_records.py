@@ -66,7 +66,6 @@ CONFIG = {
     "episodes": 5,
     "runs": 2,
 }
-MOTION = dict.fromkeys(("border_jump_m", "border_jump_rad", "median_step_m", "median_step_rad", "jerk_m_s3"))
 WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "a touch twice": ({"touched_candidates": [2, 0, 2]}, "touched_candidates different from each other"),
     "a touch of none": ({"touched_candidates": [2, 3]}, "each < n_candidates"),
@@ -105,11 +104,6 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
         {"outcome": "failure", "success_once": False},
         "success_step null where success_once is false",
     ),
-    "more held steps than steps": ({"n_held_steps": 61}, "n_held_steps ≤ n_steps"),
-    "an age beyond the episode": ({"mean_age_steps": 61.0}, "mean_age_steps ≤ n_steps"),
-    "another number of delays": ({"delay_steps": [1, 2]}, "one delay per inference"),
-    "a negative jump": ({"motion": MOTION | {"border_jump_m": -0.1}}, "border_jump_m -0.1"),
-    "a motion of other fields": ({"motion": {"smooth": True}}, "no field .motion.border_jump_m."),
     "more inferences than steps": ({"n_inferences": 61}, "n_inferences ≤ n_steps"),
     "a negative count": ({"n_clipped_steps": -1}, "n_clipped_steps -1"),
     "a choice beyond the candidates": ({"first_choice": 3}, "first_choice < n_candidates"),

@@ -61,7 +61,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     _add_run_arguments(parser)
     parser.add_argument(
-        "--delay-trace", metavar="RUN", help="play the inference delays of another run (chunking.delay.trace)"
+        "--delay-trace",
+        metavar="RUN",
+        help="replay the inference delays of another run (chunking.delay.trace)",
     )
     parser.add_argument("--suite", metavar="NAME", help="all tasks of a suite: `mikasa_base` …")
     for kind, what in CAPTURES.items():

@@ -22,7 +22,8 @@ from vla_eval.strict.bounds import (
     check_seeds,
     require,
 )
-from vla_eval.strict.decoding import formerly, read_by
+from vla_eval.strict.decoding import read_by
+from vla_eval.strict.renamed import formerly
 
 Outcomes = Literal["none", "all", "failures", "successes"]
 Which = Outcomes | int

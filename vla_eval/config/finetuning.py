@@ -18,8 +18,8 @@ from vla_eval.strict.bounds import (
     check_bounds,
     check_seeds,
 )
-from vla_eval.strict.decoding import formerly
 from vla_eval.strict.devices import check_device
+from vla_eval.strict.renamed import formerly
 
 Rank = Annotated[int, Bounds(1, 65_536)]  # of a LoRA adapter: no layer of these policies is wider
 

@@ -37,7 +37,7 @@ class RunDelays:
         if not found:
             raise RecipeError(
                 f"chunking.delay.trace: {delay.trace}: expected a run whose delays were measured, drawn or "
-                f"played, found {len(run.records)} episodes without delays of their own. Run it with --set "
+                f"replayed, found {len(run.records)} episodes without delays of their own. Run it with --set "
                 "chunking.delay=measured; a delay that is one number is given as a number."
             )
         return cls(path=Path(delay.trace), episodes=found)

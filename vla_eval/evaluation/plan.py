@@ -81,7 +81,7 @@ class Plan:
     ignored: tuple[str, ...] = ()  # what checkpoints ask for that is not done here, see `ignored_fields`
     # the part of the configuration's episodes that `jobs` are; None: all of them
     shard: Shard | None = None
-    delays: RunDelays | None = None  # those that are played
+    delays: RunDelays | None = None  # those that are replayed
 
     @property
     def warnings(self) -> list[str]:
@@ -99,8 +99,8 @@ class Plan:
         """What could not be compared."""
         parts = dict.fromkeys(group.part for group in self._groups)
         unknown = [part for part in parts if part in self.sentences and self.sentences[part] is None]
-        played = [] if self.delays is None else [self.delays.note([job.key for job in self.jobs])]
-        return [*(about_nothing_known(part) for part in unknown), *played, *self.about_measured]
+        replayed = [] if self.delays is None else [self.delays.note([job.key for job in self.jobs])]
+        return [*(about_nothing_known(part) for part in unknown), *replayed, *self.about_measured]
 
     @property
     def about_measured(self) -> list[str]:

@@ -34,7 +34,7 @@ class ObservationReader:
     states: Mapping[str, tuple[str, ...]]
     # whether a state may also be the 10 numbers of the kind `eef`, which the policy reads
     end_effector: bool
-    # of a policy whose chunks join: rows and numbers of a chunk; None: it is told nothing
+    # of a policy whose chunks join: rows and numbers of a chunk; None: it gets nothing of it
     chunk_shape: tuple[int, int] | None = None
 
     @property
@@ -60,7 +60,7 @@ class ObservationReader:
         )
 
     def read_committed(self, request: Mapping[str, Any]) -> CommittedActions | None:
-        """Return what is committed when a request is made; None if the policy is told nothing.
+        """Return what is committed when a request is made; None if the policy gets nothing of it.
 
         A request that says nothing of it is one at which nothing is.
         """

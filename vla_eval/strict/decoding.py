@@ -17,11 +17,12 @@ from typing import Any, Literal, NamedTuple, Union, get_args, get_origin, get_ty
 from vla_eval.errors import MAX_SHOWN, RecipeError, did_you_mean
 from vla_eval.strict.bounds import MAX_DEPTH
 from vla_eval.strict.json_text import WORDS, shown, wrong
+from vla_eval.strict.renamed import FORMERLY
 from vla_eval.strict.yaml_data import load_yaml as load_yaml
 
 logger = logging.getLogger(__name__)
 
-READ, FORMERLY = "read", "formerly"
+READ = "read"
 
 
 def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
@@ -36,14 +37,6 @@ def decode[T](cls: type[T], data: Mapping[str, Any], *, where: str) -> T:
 def read_by(read: Callable[[Any], Any]) -> dict[str, Any]:  # Any: plain data, not yet checked
     """Return the metadata of a dataclass field that may be written in another way; `read` rewrites it."""
     return {READ: read}
-
-
-def formerly(name: str) -> dict[str, str]:
-    """Return the metadata of a dataclass field that older files call by another name.
-
-    Both names work, the old one with one warning: `field(default=None, metadata=formerly("evaluation"))`.
-    """
-    return {FORMERLY: name}
 
 
 def current_names(cls: type) -> dict[str, str]:

@@ -132,7 +132,7 @@ class Committed:
     def arguments(
         self, batch: dict[str, Any], joining: Joining, loaded: LoadedPolicy, *, policy: str
     ) -> dict[str, Any]:
-        """Take the normalised actions out of a preprocessed batch, and return what the network is told.
+        """Take the normalised actions out of a preprocessed batch, and return what the network gets.
 
         Raises:
             InvalidActionError: the checkpoint does not give actions back that it has normalised.
