@@ -88,9 +88,7 @@ class TestMistakes:
         assert "--policy is missing" in mistake(capsys, "eval", "--task", "RememberColor3-v0")
 
     def test_an_override_of_a_field_that_is_not_there(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "Did you mean 'delay_steps'" in mistake(
-            capsys, "eval", "demo", "--set", "chunking.delay_step=1"
-        )
+        assert "Did you mean 'delay'" in mistake(capsys, "eval", "demo", "--set", "chunking.delay_step=1")
 
     def test_a_baseline_that_is_not_evaluated(self, capsys: pytest.CaptureFixture[str]) -> None:
         assert "Did you mean 'random'" in mistake(capsys, "eval", "demo", "--baseline", "randon")

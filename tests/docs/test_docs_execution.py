@@ -49,7 +49,8 @@ NOT_EXECUTED: Mapping[str, str] = {
     r"record .*--set env.control_mode=.*|record offline_rl .*": (
         "joints, which the fake simulator has not; tests/data/test_record_maniskill.py"
     ),
-    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/memory/.*": (
+    r"eval .*--delay-trace .*": "a run whose delays were measured; tests/evaluation/test_delays.py",
+    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/(memory|base_table)/.*": (
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
     r"serve --policy pi05 .*": "fetched weights and a GPU; tests/cli/test_serve.py",

@@ -80,7 +80,7 @@ def test_a_task_whose_best_memoryless_player_is_unknown_has_no_row_and_no_score_
 def test_what_a_robot_needs_is_refused_by_name() -> None:
     with pytest.raises(RecipeError, match=r"n_action_steps: \[4\]: mikasa_base/MemoryLengthEasy-v0"):
         make_plan(_config(n_action_steps=[4]))
-    with pytest.raises(RecipeError, match=r"chunking\.delay_steps: mikasa_base/.*: no action"):
+    with pytest.raises(RecipeError, match=r"chunking\.delay: mikasa_base/.*: no action"):
         make_plan(_config(chunking={"delay_steps": 1}))
     with pytest.raises(SpecMismatchError, match="it has to be trained"):
         make_plan(_config(tasks=["RememberColor3-v0"], policies=["memoryless"]))

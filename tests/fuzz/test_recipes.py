@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from tests.evaluation.resolved import fingerprint, make_plan
 from tests.fuzz.recipe_cases import changed_recipe, damaged_text, outcome, shipped, yaml_text
 from vla_eval.cli.main import main
+from vla_eval.config.agents import AgentTable
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, Recipe, load_recipe, to_data
@@ -24,7 +25,7 @@ from vla_eval.strict.decoding import decode, load_yaml
 TASK = "RememberColor3-v0"
 FEW_EPISODES = 1000  # a longer plan takes seconds and is no other
 CLASSES: dict[Folder, tuple[type[Any], ...]] = {
-    "configs": (EvalConfig, ModelTable, FinetuneConfig),
+    "configs": (EvalConfig, ModelTable, AgentTable, FinetuneConfig),
     "policies": (PolicyRecipe,),
     "prompts": (PromptRecipe,),
     "datasets": (DatasetRecipe,),

@@ -10,6 +10,7 @@ from typing import NamedTuple
 from vla_eval.base_tasks.catalog import base_task
 from vla_eval.base_tasks.row import NAMESPACE
 from vla_eval.cli.terminal.screen import filled
+from vla_eval.config.agents import AgentTable, is_agent_table
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe, no_such_path, recipe_fields
@@ -31,7 +32,7 @@ OFFICIAL_PHASES: dict[PhaseSource, str] = {
 }
 
 
-_RecipeClass = type[PolicyRecipe | EvalConfig | ModelTable | DatasetRecipe | Protocol]
+_RecipeClass = type[PolicyRecipe | EvalConfig | ModelTable | AgentTable | DatasetRecipe | Protocol]
 
 
 class _Kind(NamedTuple):
@@ -128,7 +129,7 @@ def _kind_of_file(name: str) -> Folder:
     """Return which kind of recipe has all the fields of a file."""
     given = recipe_fields("configs", name)
     for folder, kind in KINDS.items():
-        for cls in (kind.recipe, *((ModelTable,) if folder == "configs" else ())):
+        for cls in (kind.recipe, *((ModelTable, AgentTable) if folder == "configs" else ())):
             if given <= {field.name for field in fields(cls)}:
                 return folder
     raise RecipeError(
@@ -139,11 +140,17 @@ def _kind_of_file(name: str) -> Folder:
 
 def _show_recipe(folder: Folder, name: str) -> None:
     kind = KINDS[folder]
-    cls: _RecipeClass = ModelTable if folder == "configs" and is_model_table(name) else kind.recipe
+    cls: _RecipeClass = kind.recipe
+    if folder == "configs" and is_model_table(name):
+        cls = ModelTable
+    elif folder == "configs" and is_agent_table(name):
+        cls = AgentTable
     recipe = load_recipe(folder, name, cls)
     next_step = kind.next_step
     if isinstance(recipe.value, PolicyRecipe) and recipe.value.finetune is not None:
         next_step = "mikasa-vla finetune --policy {name} --dataset DIR"
+    elif cls is AgentTable:
+        next_step = "mikasa-vla train-agent {name}"
     elif cls is ModelTable:
         next_step = "mikasa-vla finetune {name}, then mikasa-vla eval {name}"
     _print(kind.word, recipe.name)

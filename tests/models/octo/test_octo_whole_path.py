@@ -15,6 +15,7 @@ from tests.models.octo.tiny_octo import GOLDEN, convert
 from tests.models.stored_frames import StoredFrames, context, executed
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import ActionChunk, FloatArray, ObservationWindow
+from vla_eval.latency import EpisodeDelays
 from vla_eval.policies.lerobot import policy as lerobot
 from vla_eval.specs import PolicySpec
 
@@ -114,10 +115,12 @@ def test_an_episode_executes_what_the_original_samples(
 def test_an_ensemble_of_chunks_executes_the_originals_means(io: GoldenValues, decay: float) -> None:
     chunks = io[f"data.ensemble_w{decay}.chunks"].numpy()
     spec = ChunkingSpec(n_action_steps=1, mode="temporal_ensemble", ensemble_decay=decay)
-    executor, found = ChunkExecutor(spec), []
+    executor, found = ChunkExecutor(spec, EpisodeDelays(delay=0, seed=1, control_hz=20.0)), []
     for step, chunk in enumerate(chunks):
-        executor.submit(step, ActionChunk(actions=chunk.astype(np.float32)))
-        found.append(executor.action(step))
+        executor.submit(step, ActionChunk(actions=chunk.astype(np.float32)), seconds=0.0)
+        executed_now = executor.action(step)
+        assert executed_now is not None
+        found.append(executed_now.action)
     np.testing.assert_allclose(found, io[f"data.ensemble_w{decay}.executed"].numpy(), atol=1e-6, rtol=0)
 
 

@@ -37,7 +37,7 @@ FINETUNE_FLAGS = (
 EVAL_FLAGS = (
     *("protocol", "suite", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
     *("seed_start", "runs", "overrides", "capture_video", "capture_rrd", "capture_strip"),
-    "serve",
+    *("delay_trace", "serve"),
 )
 """Flags that a table does not take, by the names of their values; `--task` and `--policy` choose a part."""
 

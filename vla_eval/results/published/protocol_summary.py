@@ -8,6 +8,7 @@ from typing import NamedTuple
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import to_data
 from vla_eval.config.protocol import Protocol, load_protocol
+from vla_eval.config.recorded_chunking import recorded_chunking
 from vla_eval.errors import RecipeError, UnknownNameError, some_of
 from vla_eval.results.estimates import estimate_runs, mean_interval
 from vla_eval.results.grouping import TASK_VERSIONS, VARIANT_FIELDS, Grouping, RowEpisodes, RowKey
@@ -170,7 +171,9 @@ def _setting_departures(
 
 
 def _settings(protocol: Protocol, run: StoredRun) -> Iterator[str]:
-    defaults = to_data(EvalConfig(name="defaults", tasks=("any",), policies=("any",)))
+    default = EvalConfig(name="defaults", tasks=("any",), policies=("any",))
+    defaults = to_data(default)
+    defaults["chunking"] = recorded_chunking(default.chunking, defaults["chunking"])
     config = run.description.config
     expected = dict(leaves({name: defaults[name] for name in VARIANT_FIELDS}, prefix=""))
     # A field that a run does not name had its default in the version that wrote it.
