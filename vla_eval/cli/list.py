@@ -7,8 +7,9 @@ from typing import get_args
 
 from vla_eval.base_tasks.catalog import base_task
 from vla_eval.checkpoints.bases import FIRST_TRAININGS
+from vla_eval.cli.shared.config_kinds import config_class
 from vla_eval.cli.terminal.screen import NARROWEST, filled, screen_width
-from vla_eval.config.agents import AgentTable, is_agent_table
+from vla_eval.config.agents import AgentTable
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe
@@ -16,7 +17,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import PromptRecipe, instruction_for
 from vla_eval.config.protocol import Protocol
 from vla_eval.errors import PluginError, RecipeError, VlaEvalError
-from vla_eval.evaluation.model_table import ModelTable, is_model_table
+from vla_eval.evaluation.model_table import ModelTable
 from vla_eval.policies.registry import policy_adapters
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.tasks.catalog import FAMILIES, SUITES, installed_tasks
@@ -161,17 +162,11 @@ def _broken(name: str, exc: VlaEvalError) -> Row:
     return (name, f"CANNOT BE READ: {exc}")
 
 
-def _kind_of_config(name: str) -> RecipeClass:
-    if is_model_table(name):
-        return ModelTable
-    return AgentTable if is_agent_table(name) else EvalConfig
-
-
 _LISTS: dict[str, Callable[[], Groups]] = {
     "tasks": _tasks,
     "families": _families,
     "policies": _policies,
-    "configs": lambda: _recipes("configs", _kind_of_config),
+    "configs": lambda: _recipes("configs", config_class),
     "prompts": lambda: _recipes("prompts", lambda _name: PromptRecipe),
     "datasets": lambda: _recipes("datasets", lambda _name: DatasetRecipe),
     "protocols": lambda: _recipes("protocols", lambda _name: Protocol),

@@ -207,8 +207,10 @@ def _run_grid(args: argparse.Namespace) -> int:
     from vla_eval.probe.grid_text import render_grid
     from vla_eval.probe.page.heat_maps import write_heat_maps
 
-    config = _config(args)
-    grid = plan_grid(config, _grid_settings(args), chunk_size=_shortest_chunk(config))
+    config, settings = _config(args), _grid_settings(args)
+    # Only these ask for it: policies are read, and servers asked, once more.
+    chunk_size = _shortest_chunk(config) if "latency" in settings.axes else None
+    grid = plan_grid(config, settings, chunk_size=chunk_size)
     for task in grid.left_out:
         print(f"left out: {task}", file=sys.stderr)
     print(f"{len(grid.worlds)} run folders, {grid.n_episodes} episodes", file=sys.stderr)
@@ -225,17 +227,11 @@ def _run_grid(args: argparse.Namespace) -> int:
 
 def _shortest_chunk(config: EvalConfig) -> int | None:
     """Return how many actions the shortest chunk of the policies has; None where none is known."""
-    from vla_eval.checkpoints.notes import known_chunk_size
+    from vla_eval.evaluation.plan_checks import chunk_sizes
     from vla_eval.policies.entries import load_policy_entries
 
-    known = [
-        policy.server.chunk_size
-        if policy.server is not None
-        else known_chunk_size(recipe.value.adapter, recipe.value.args, recipe=recipe.name)
-        for policy in load_policy_entries(config.policies)
-        for recipe in policy.recipes
-    ]
-    return min((size for size in known if size is not None), default=None)
+    policies = load_policy_entries(config.policies)
+    return min((size for policy in policies for size in chunk_sizes(policy)), default=None)
 
 
 def _run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | None:

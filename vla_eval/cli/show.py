@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 from vla_eval.base_tasks.catalog import base_task
 from vla_eval.base_tasks.row import NAMESPACE
+from vla_eval.cli.shared.config_kinds import CONFIG_CLASSES, config_class
 from vla_eval.cli.terminal.screen import filled
-from vla_eval.config.agents import AgentTable, is_agent_table
+from vla_eval.config.agents import AgentTable
 from vla_eval.config.dataset import DatasetRecipe
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Folder, list_recipes, load_recipe, no_such_path, recipe_fields
@@ -18,7 +19,7 @@ from vla_eval.config.policy import PolicyRecipe
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.config.protocol import Protocol
 from vla_eval.errors import RecipeError, some_of, unknown_name
-from vla_eval.evaluation.model_table import ModelTable, is_model_table
+from vla_eval.evaluation.model_table import ModelTable
 from vla_eval.tasks.catalog import FAMILIES, TASKS, find_task, installed_tasks, task_spec
 from vla_eval.tasks.source import TaskArgument, task_arguments
 from vla_eval.tasks.spec import PhaseSource, TaskSpec
@@ -129,7 +130,7 @@ def _kind_of_file(name: str) -> Folder:
     """Return which kind of recipe has all the fields of a file."""
     given = recipe_fields("configs", name)
     for folder, kind in KINDS.items():
-        for cls in (kind.recipe, *((ModelTable, AgentTable) if folder == "configs" else ())):
+        for cls in (kind.recipe, *(CONFIG_CLASSES if folder == "configs" else ())):
             if given <= {field.name for field in fields(cls)}:
                 return folder
     raise RecipeError(
@@ -140,11 +141,7 @@ def _kind_of_file(name: str) -> Folder:
 
 def _show_recipe(folder: Folder, name: str) -> None:
     kind = KINDS[folder]
-    cls: _RecipeClass = kind.recipe
-    if folder == "configs" and is_model_table(name):
-        cls = ModelTable
-    elif folder == "configs" and is_agent_table(name):
-        cls = AgentTable
+    cls: _RecipeClass = config_class(name) if folder == "configs" else kind.recipe
     recipe = load_recipe(folder, name, cls)
     next_step = kind.next_step
     if isinstance(recipe.value, PolicyRecipe) and recipe.value.finetune is not None:

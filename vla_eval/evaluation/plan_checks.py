@@ -1,6 +1,6 @@
 """What can be wrong with a configuration: found before the first episode, with what to do."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 from vla_eval.checkpoints.notes import (
     LEROBOT_CHECKPOINTS,
@@ -116,13 +116,18 @@ def check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
 def check_chunks(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:
     """Refuse a policy without weights, and more action steps than a checkpoint or server predicts at once."""
     for policy in policies:
-        for recipe in policy.recipes:
-            known = known_chunk_size(recipe.value.adapter, recipe.value.args, recipe=recipe.name)
-            chunk_size = known if policy.server is None else policy.server.chunk_size
-            if chunk_size is None:
-                continue
+        for chunk_size in chunk_sizes(policy):
             for n_action_steps in steps_of(config, policy):
                 config.chunking.at(n_action_steps).check_chunk_size(chunk_size, policy=policy.name)
+
+
+def chunk_sizes(policy: PolicyEntry) -> Iterator[int]:
+    """Yield how many actions the chunks of a policy's checkpoints or server have, where that is known."""
+    for recipe in policy.recipes:
+        known = known_chunk_size(recipe.value.adapter, recipe.value.args, recipe=recipe.name)
+        chunk_size = known if policy.server is None else policy.server.chunk_size
+        if chunk_size is not None:
+            yield chunk_size
 
 
 def steps_of(config: EvalConfig, policy: PolicyEntry, task: TaskSpec | None = None) -> tuple[int, ...]:

@@ -1,7 +1,7 @@
 """Find the worlds of probes and grids among run folders, by what their `run.json` states."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from vla_eval.config.evaluation import EvalConfig, ProbedWorld
@@ -112,14 +112,14 @@ def _world(run: StoredRun) -> World | GridWorld | None:
         return World(task=tasks[0], intervention=stated.change, level=stated.level, config=config)
     check_names("axis", [stated.change], AXES, where=where)
     section, spec = run.description.config.get("chunking"), task_spec(tasks[0])
+    chunking = read_chunking(section if isinstance(section, dict) else {}, where=str(run.path))
     return GridWorld(
         task=tasks[0],
         axis=next(axis for axis in AXES if axis == stated.change),
         level=int(stated.level or 0),
         first_inference_step=stated.first_inference_step,
         phases=None if spec.candidates is None else fixed_phases(spec, config.env),
-        chunking=read_chunking(section if isinstance(section, dict) else {}, where=str(run.path)),
-        config=config,
+        config=replace(config, chunking=chunking),
     )
 
 

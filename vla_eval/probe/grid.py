@@ -6,7 +6,7 @@ first one is. So every first inference below K is run there.
 
 import re
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Literal
 
@@ -62,7 +62,11 @@ class GridWorld:
     first_inference_step: int
     phases: Phases | None  # None for a task without any
     config: EvalConfig
-    chunking: ChunkingSettings = field(default_factory=ChunkingSettings)
+
+    @property
+    def chunking(self) -> ChunkingSettings:
+        """How chunks are executed."""
+        return self.config.chunking
 
     @property
     def place(self) -> tuple[str, str, int, int, str]:
@@ -178,14 +182,13 @@ def _at_each_first(
         own = tuple(k for k in sizes if first in firsts[k])
         if not own or (settings.first_inferences and first not in settings.first_inferences):
             continue
-        chunking = replace(config.chunking, first_inference_step=first)
         of_world = replace(
             config,
             name=f"{spec.id}_grid_{axis}_{level}{mode}_from_{first}",
             tasks=(spec.id,),
             policies=policies,
             n_action_steps=own,
-            chunking=chunking,
+            chunking=replace(config.chunking, first_inference_step=first),
             world=ProbedWorld(change=axis, level=level, first_inference_step=first),
         )
         yield GridWorld(
@@ -194,6 +197,5 @@ def _at_each_first(
             level=level,
             first_inference_step=first,
             phases=phases,
-            chunking=chunking,
             config=of_world,
         )

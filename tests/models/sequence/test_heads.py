@@ -10,7 +10,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from torch import Tensor
 
-from vla_eval.models.sequence.heads import ChunkHead, FlowHead
+from vla_eval.models.sequence.heads import FlowHead, PrefixReader
 from vla_eval.models.shared.prefix import Prefix, drawn_prefix
 
 WIDTH, CHUNK, DIMS = 16, 6, 2
@@ -103,7 +103,7 @@ class TestPrefix:
 
     def test_a_head_that_makes_chunks_at_once_reads_what_is_decided_and_no_more(self) -> None:
         torch.manual_seed(0)
-        head = ChunkHead(WIDTH, (CHUNK, DIMS), prefix_steps=3)
+        head = PrefixReader(WIDTH, (CHUNK, DIMS), prefix_steps=3)
         decided, actions = demonstrations()
         mask = (torch.arange(CHUNK) < 2).expand(4, -1)
         beyond = actions.clone()

@@ -24,8 +24,8 @@ class Gated(nn.Module):
         return gated
 
 
-class ChunkHead(nn.Module):
-    """A chunk at once, by a linear layer; it may read a prefix."""
+class PrefixReader(nn.Module):
+    """What lets a head that makes a chunk at once read a prefix: nothing, without `prefix_steps`."""
 
     def __init__(self, width: int, shape: tuple[int, int], *, prefix_steps: int) -> None:
         super().__init__()

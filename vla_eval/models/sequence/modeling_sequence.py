@@ -18,7 +18,7 @@ from vla_eval.models.sequence.configuration_sequence import TYPE, MikasaSequence
 from vla_eval.models.sequence.core import CoreMemory
 from vla_eval.models.sequence.cores import make_core
 from vla_eval.models.sequence.encoders import Cameras
-from vla_eval.models.sequence.heads import ChunkHead, FlowHead, Gated
+from vla_eval.models.sequence.heads import FlowHead, Gated, PrefixReader
 from vla_eval.models.sequence.sizes import CORES
 from vla_eval.models.shared.precision import in_float32
 from vla_eval.models.shared.prefix import Prefix, drawn_prefix
@@ -61,7 +61,7 @@ class SequenceNetwork(nn.Module):
         self.flow = FlowHead(width, self.shape) if config.head == "flow" else None
         if self.flow is None:
             self.actions = nn.Linear(width, self.shape[0] * self.shape[1])
-            self.prefix = ChunkHead(width, self.shape, prefix_steps=config.prefix_steps)
+            self.prefix = PrefixReader(width, self.shape, prefix_steps=config.prefix_steps)
         self.goal = nn.Linear(width, SPACE)
         if config.reads_returns:
             self.returns = nn.Linear(1, width)

@@ -15,7 +15,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from torch import Tensor
 
 from vla_eval.checkpoints.loading import LoadedPolicy
-from vla_eval.chunking import ChunkingSpec, Mode, RtcSettings
+from vla_eval.chunking import ChunkingSpec, RtcSettings
 from vla_eval.core import CommittedActions
 from vla_eval.errors import InvalidActionError, SpecMismatchError
 from vla_eval.features import ACTION_KEY
@@ -99,19 +99,18 @@ class Prefixed:
 
 
 def joining_of(
-    loaded: LoadedPolicy, chunking: ChunkingSpec | None, *, policy: str, is_compiled: bool
+    loaded: LoadedPolicy, chunking: ChunkingSpec, *, policy: str, is_compiled: bool
 ) -> Joining | None:
     """Return how a policy's chunks join in the mode of an evaluation; None: they do not.
 
     Raises:
         SpecMismatchError: the policy cannot do what the mode asks for.
     """
-    mode: Mode | None = None if chunking is None else chunking.mode
-    if chunking is None or not chunking.execution.commits:
+    if not chunking.execution.commits:
         return None
-    if mode == "prefix":
-        return Prefixed(loaded, policy=policy)
-    return Guided(loaded, chunking.rtc, policy=policy, is_compiled=is_compiled)
+    if chunking.execution.is_guided:
+        return Guided(loaded, chunking.rtc, policy=policy, is_compiled=is_compiled)
+    return Prefixed(loaded, policy=policy)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
