@@ -10,7 +10,7 @@ value is keyed by it. An episode is a function of (task, seed, actions) alone, w
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable  # Any: arrays of any dtype
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ Stage = Literal["setup", "reset", "step", "inference"]
 
 FloatArray = NDArray[np.float32]
 ImageArray = NDArray[np.uint8]
+MemoryArrays = Mapping[str, NDArray[Any]]
+"""What a policy keeps of an episode, by name; which names, dtypes and shapes is the policy's own affair."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,6 +175,29 @@ class ForgettingPolicy(Policy, Protocol):
 
     def forget(self, slots: Sequence[int]) -> None:
         """Release the memory of these slots: their next call is `reset`."""
+
+
+@runtime_checkable
+class RememberingPolicy(Policy, Protocol):
+    """A policy whose memory can be read and replaced, if `PolicySpec.has_memory` says so.
+
+    A memory is complete: an episode whose next inferences follow a `set_memory` is bit-equal to the one that
+    it was taken from. What is drawn at an inference and what is still to be executed are not part of it.
+    """
+
+    def get_memory(self, slot: int) -> MemoryArrays:
+        """Return what is kept after the slot's last inference; before the first: what an episode begins with.
+
+        Raises:
+            SpecMismatchError: what the policy keeps cannot be read.
+        """
+
+    def set_memory(self, slot: int, memory: MemoryArrays) -> None:
+        """Put a memory in place of the slot's; it keeps no reference to the arrays.
+
+        Raises:
+            SpecMismatchError: the arrays are not those of such a policy; nothing is changed.
+        """
 
 
 class StepObserver(Protocol):

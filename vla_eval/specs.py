@@ -74,6 +74,8 @@ class PolicySpec:
     chunk_size: int  # how many actions one inference gives
     privileged: bool = False  # whether it reads the true state of the world (scripted controls only)
     reads_committed: bool = False  # whether its chunks join `ObservationWindow.committed`
+    # whether it keeps something from one inference to the next, and `get_memory` and `set_memory` handle it
+    has_memory: bool = False
 
     def is_given(self, step: int, next_inference_step: int, *, horizon_steps: int) -> bool:
         """Whether the policy will be given the observation at `step`: nothing after the last inference is."""

@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file
@@ -13,10 +14,16 @@ pytest.importorskip("stable_baselines3", reason="needs `make rl`")
 
 from tests.agents.tiny_agents import BIT, ROBOT, TINY, tiny, trained
 from vla_eval.agents.train import train_agent
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.cli.main import main
 from vla_eval.cli.shared.folders import agent_evaluation
+from vla_eval.config.environment import EnvSettings
 from vla_eval.config.finetuning import HeldOutConfig
+from vla_eval.core import EpisodeStart, ObservationWindow
+from vla_eval.envs.factory import make_env
 from vla_eval.errors import MissingDependencyError, SpecMismatchError, VlaEvalError
+from vla_eval.policies.agents.policy import AgentPolicy, make_agent
+from vla_eval.policies.context import PolicyContext
 from vla_eval.serving.host import HostOptions, host_policy
 from vla_eval.storage.run_folder import read_run
 
@@ -49,6 +56,41 @@ def test_an_agent_is_evaluated_from_its_folder_and_episodes_do_not_share_a_memor
     one = evaluated(agents / algorithm, tmp_path / "one")
     four = evaluated(agents / algorithm, tmp_path / "four", "--set", "slots_per_worker=4")
     assert len(one) == 4 and one == four
+
+
+@pytest.mark.parametrize("algorithm", [*TINY])
+def test_the_memory_of_an_agent_is_complete_and_typed(algorithm: str, agents: Path) -> None:
+    simulator = make_env(EnvSettings(task=ROBOT, simulator="fake", privileged=True))
+    env, rng = simulator.spec, np.random.default_rng(0)
+    frames = [simulator.reset({0: 1}, render=False)[0].observation]
+    for _ in range(5):
+        action = rng.uniform(-1, 1, len(env.action.dims)).astype(np.float32)
+        frames.append(simulator.step({0: action}, render=frozenset())[0].observation)
+    context = PolicyContext(name="a", env=env, chunking=ChunkingSpec(n_action_steps=1), n_candidates=3)
+
+    def make() -> AgentPolicy:
+        return make_agent(context, checkpoint=str(agents / algorithm))
+
+    policy = make()
+    assert policy.spec.has_memory is (algorithm == "ppo_lstm")
+
+    def acts(policy: AgentPolicy, steps: range) -> list[Any]:
+        return [
+            policy.act(ObservationWindow(slot=0, frames=(frames[step],))).actions.tolist() for step in steps
+        ]
+
+    start = EpisodeStart(slot=0, task=ROBOT, seed=1, run=0, instruction="touch it", horizon_steps=60)
+    for n_before in (0, 1, 3):
+        policy.reset([start])
+        acts(policy, range(n_before))
+        memory, other = policy.get_memory(0), make()
+        other.reset([start])
+        other.set_memory(0, memory)
+        assert acts(other, range(n_before, 6)) == acts(policy, range(n_before, 6))
+        for name, part in memory.items():
+            for wrong in ({name: part}, {**memory, name: part[0]}, {**memory, name: part.astype(np.float64)}):
+                with pytest.raises(SpecMismatchError, match="set_memory: expected"):
+                    other.set_memory(0, wrong)
 
 
 def test_an_agent_of_mikasa_base_is_evaluated_beside_its_controls(

@@ -14,6 +14,7 @@ from vla_eval.core import (
     Observation,
     ObservationWindow,
     Policy,
+    RememberingPolicy,
 )
 from vla_eval.errors import ConformanceError, VlaEvalError
 from vla_eval.specs import EnvSpec, PolicySpec, check_compatible
@@ -26,6 +27,10 @@ HORIZON_STEPS = 60
 SAME = "The same episode seed and observations give the same actions"
 FORGET = (
     "Forget everything of a slot in `reset`; draw random numbers from a generator seeded by `episode.seed`."
+)
+CONTINUED = "when its memory is read, lost, and put back"
+COMPLETE = (
+    "`get_memory` returns copies of all that is kept between two inferences; `set_memory` puts them in place."
 )
 BY_SLOT = "Keep your state by `window.slot`: `reset` begins the given slots only."
 
@@ -106,6 +111,23 @@ def _check_independence(
     in_turn = (0, 0), (1, 1), (3, runs.n_inferences)  # the last begins where the first has ended
     meanwhile = [_Episode(seed=seed, begins_after=turn) for seed, turn in in_turn]
     met.same(runs.run(policy, *meanwhile), "when another episode begins or ends meanwhile", BY_SLOT)
+    if policy.spec.has_memory:
+        _check_memory(make, policy, runs, met)
+
+
+def _check_memory(make: Callable[[], Policy], policy: Policy, runs: "_Runs", met: "_Requirements") -> None:
+    """Compare episodes whose memory was moved with the same ones left alone."""
+    for where, owner in (("", policy), (", by a new policy", make())):
+        claim(
+            isinstance(policy, RememberingPolicy) and isinstance(owner, RememberingPolicy),
+            "A policy whose spec has `has_memory` has `get_memory` and `set_memory`.",
+            advice="Add them, or leave `has_memory` out.",
+        )
+        assert isinstance(policy, RememberingPolicy)
+        assert isinstance(owner, RememberingPolicy)
+        after = (0, 1, 2, runs.n_inferences - 1)
+        moved = [runs.moved(policy, owner, seed, after=n) for seed, n in zip(SEEDS, after, strict=True)]
+        met.same(moved, f"{CONTINUED}{where}", COMPLETE)
 
 
 class _PolicyError(ConformanceError):
@@ -166,15 +188,46 @@ class _Runs:
         for turn in range(self.n_inferences + max(episode.begins_after for episode in episodes)):
             begins = [one for one in episodes if one.begins_after == turn]
             if begins:
-                with _named("reset", begins, chunk_size=self._spec.chunk_size):
-                    policy.reset([self._start(episode) for episode in begins])
+                self.begin(policy, begins)
             due = [one for one in episodes if 0 <= turn - one.begins_after < self.n_inferences]
             if alternating and turn % 2:
                 due.reverse()
-            for episode, chunk in zip(due, self._act(policy, due), strict=True):
-                self._check(chunk, earlier=episode.chunks, seed=episode.seed)
-                episode.chunks.append(chunk)
+            self.infer(policy, due)
         return episodes
+
+    def begin(self, policy: Policy, episodes: Sequence[_Episode]) -> None:
+        """Reset a policy for these episodes."""
+        with _named("reset", episodes, chunk_size=self._spec.chunk_size):
+            policy.reset([self._start(episode) for episode in episodes])
+
+    def infer(self, policy: Policy, episodes: Sequence[_Episode]) -> None:
+        """Add the next chunk of each episode."""
+        for episode, chunk in zip(episodes, self._act(policy, episodes), strict=True):
+            self._check(chunk, earlier=episode.chunks, seed=episode.seed)
+            episode.chunks.append(chunk)
+
+    def moved(
+        self, policy: RememberingPolicy, owner: RememberingPolicy, seed: int, *, after: int
+    ) -> _Episode:
+        """Return an episode; its memory goes from one policy to the other after so many inferences.
+
+        In between, another episode runs in its slot of both.
+        """
+        episode = _Episode(seed=seed)
+        self.begin(policy, [episode])
+        for _ in range(after):
+            self.infer(policy, [episode])
+        with _named("get_memory", [episode], chunk_size=self._spec.chunk_size):
+            memory = policy.get_memory(episode.slot)
+        other = next(one for one in SEEDS if one != seed and ROWS[one] == ROWS[seed])
+        for one in (policy, owner):
+            self.run(one, _Episode(seed=other))
+        self.begin(owner, [episode])
+        with _named("set_memory", [episode], chunk_size=self._spec.chunk_size):
+            owner.set_memory(episode.slot, memory)
+        while len(episode.chunks) < self.n_inferences:
+            self.infer(owner, [episode])
+        return episode
 
     def alone(self, policy: Policy, seed: int) -> list[ActionChunk]:
         """Return an episode's chunks alone; a policy that refuses a sentence gets its own."""

@@ -51,21 +51,21 @@ def recall(
     first = policy.begin_memory(len(rows))
     _check(first, first, len(rows), where="begin_memory")
     begun = [memory_of(first, row) if e.memory is None else e.memory for row, e in enumerate(rows)]
-    memory = _like(first, [torch.stack(parts) for parts in zip(*begun, strict=True)])
+    memory = like(first, [torch.stack(parts) for parts in zip(*begun, strict=True)])
     for index in range(max(len(episode.unseen) for episode in rows)):
         # A row without a frame at this step computes with its newest one, to no effect.
         frames = [episode.unseen[min(index, len(episode.unseen) - 1)] for episode in rows]
         has_frame = torch.tensor([index < len(episode.unseen) for episode in rows])
         batch = preprocess([frame if singly else frames_in_time([frame]) for frame in frames])
-        after = policy.remember(batch, _like(memory, [part.clone() for part in memory]))
+        after = policy.remember(batch, like(memory, [part.clone() for part in memory]))
         _check(after, memory, len(rows), where="remember")
-        memory = _like(memory, [_chosen(has_frame, *parts) for parts in zip(after, memory, strict=True)])
+        memory = like(memory, [_chosen(has_frame, *parts) for parts in zip(after, memory, strict=True)])
     return memory
 
 
 def memory_of(memory: Memory, row: int) -> Memory:
     """Return a copy of what is remembered of one episode: it must not keep the memory of all others."""
-    return _like(memory, [part[row].clone() for part in memory])
+    return like(memory, [part[row].clone() for part in memory])
 
 
 def _chosen(has_frame: Tensor, after: Tensor, before: Tensor) -> Tensor:
@@ -74,7 +74,8 @@ def _chosen(has_frame: Tensor, after: Tensor, before: Tensor) -> Tensor:
     return torch.where(per_row, after, before).contiguous()
 
 
-def _like(memory: Memory, parts: Sequence[Tensor]) -> Memory:
+def like(memory: Memory, parts: Sequence[Tensor]) -> Memory:
+    """Return these parts as a memory of the same kind."""
     make = getattr(type(memory), "_make", tuple)  # of named tuples
     return make(parts)
 

@@ -37,7 +37,7 @@ class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyp
             self.n_trained += len(batch[ACTION_KEY])
         return episodes_of(batch, config, training=self.training, same_action=same_action, may_stay=may_stay)
 
-    def set_memory(self, begin: Any, *, remembers: bool) -> None:
+    def declare_memory(self, begin: Any, *, remembers: bool) -> None:
         """Give the policy the methods of one that remembers; `begin` makes the memory of so many episodes."""
         self._remembers = remembers
         if remembers:

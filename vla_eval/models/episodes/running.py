@@ -96,6 +96,16 @@ def frames_in_time(frames: Sequence[Frame]) -> dict[str, Tensor]:
     return {key: torch.stack([frame[key] for frame in frames]) for key in frames[0]}
 
 
+def begun_queues(policy: Any) -> Mapping[str, Any] | None:
+    """Return the queues of an episode that begins, of a policy that is asked for one action per step."""
+    owner = policy.select_action.__self__
+    names = family_of(owner.config.type).queues
+    if not names:
+        return None
+    owner.reset()
+    return {name: copy.deepcopy(getattr(owner, name)) for name in names}
+
+
 class Step(NamedTuple):
     """A chunk (B, 1, D) of one action, and the policy's queues after it."""
 

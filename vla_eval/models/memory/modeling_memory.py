@@ -43,7 +43,7 @@ class MikasaMemoryPolicy(EpisodePolicy):
         self.network = MemoryNetwork(sizes, remembers=config.remembers)
         units = action_units(joint_targets=sizes.joint_targets, action=sizes.action)
         self.register_buffer("units", units, persistent=False)
-        self.set_memory(self.network.begin, remembers=config.remembers)
+        self.declare_memory(self.network.begin, remembers=config.remembers)
 
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""

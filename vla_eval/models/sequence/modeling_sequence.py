@@ -158,7 +158,7 @@ class MikasaSequencePolicy(EpisodePolicy):
         super().__init__(config)
         self.config: MikasaSequenceConfig = config
         self.network = SequenceNetwork(config)
-        self.set_memory(self.network.begin, remembers=CORES[config.core].remembers)
+        self.declare_memory(self.network.begin, remembers=CORES[config.core].remembers)
         self.draws_nothing = config.noise_shape is None
         self.rtc_processor: RTCProcessor | None = None
 

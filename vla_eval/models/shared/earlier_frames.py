@@ -2,11 +2,14 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any  # arrays of several dtypes
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from vla_eval.models.shared.frame_choice import FrameChoice, Seen
+from vla_eval.models.shared.frame_choice import BLOCKS, Event, FrameChoice, Seen
 from vla_eval.models.shared.images import in_bytes
 
 SEGMENT_PADDING_KEY = "segment_is_pad"
@@ -76,6 +79,58 @@ class FrameMemory:
         images = {**self.images, seen.n_frames - 1: {camera: frame[camera] for camera in self.cameras}}
         wanted = self.choice.wanted(seen)
         kept = {number: images[number] for number in images if number in wanted}
+        return replace(self, seen=seen, images=kept)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return all of it: number of frames, what the rule keeps, and the images with their numbers."""
+        found: dict[str, NDArray[Any]] = {"n_frames": np.array(self.seen.n_frames)}
+        if self.seen.blocks is not None:
+            found |= {f"blocks_{n}": blocks for n, blocks in zip(BLOCKS, self.seen.blocks, strict=True)}
+        if self.seen.events:
+            found["events"] = np.array(self.seen.events)
+        if self.images:
+            found["numbers"] = np.array(sorted(self.images))
+            for camera in self.cameras:
+                images = [self.images[number][camera] for number in sorted(self.images)]
+                found[f"images/{camera}"] = torch.stack(images).numpy()
+        return found
+
+    def with_arrays(self, arrays: Mapping[str, NDArray[Any]]) -> "FrameMemory":
+        """Return a memory of the same rule with what `arrays` returned; `ValueError` for others."""
+        known = {"n_frames", "events", "numbers", *(f"blocks_{n}" for n in BLOCKS)}
+        known |= {f"images/{camera}" for camera in self.cameras}
+        blocks = tuple(arrays[f"blocks_{n}"] for n in BLOCKS if f"blocks_{n}" in arrays)
+        events = arrays.get("events", np.empty((0, 2)))
+        numbers = arrays.get("numbers", np.empty(0, dtype=np.int64))
+        images = {camera: arrays[f"images/{camera}"] for camera in self.cameras if len(numbers)}
+        problems = (
+            (bool(set(arrays) - known), f"expected {', '.join(sorted(known))}, found {', '.join(arrays)}"),
+            (arrays["n_frames"].shape != () or arrays["n_frames"].dtype.kind != "i", "n_frames is no number"),
+            (
+                [block.shape for block in blocks] not in ([], [(3, n, n) for n in BLOCKS]),
+                "the blocks have other shapes",
+            ),
+            (events.ndim != 2 or events.shape[1:] != (2,), f"expected events (N, 2), found {events.shape}"),
+            (numbers.ndim != 1 or numbers.dtype.kind != "i", "the numbers of images are no list of numbers"),
+            (
+                any(
+                    array.shape[:1] != numbers.shape or array.dtype != np.float32 for array in images.values()
+                ),
+                "expected a float32 image for each number",
+            ),
+        )
+        for is_wrong, problem in problems:
+            if is_wrong:
+                raise ValueError(problem)
+        seen = Seen(
+            n_frames=int(arrays["n_frames"]),
+            blocks=blocks or None,
+            events=tuple(Event(int(number), float(changed)) for number, changed in events),
+        )
+        kept = {
+            int(number): {camera: torch.from_numpy(array[i].copy()) for camera, array in images.items()}
+            for i, number in enumerate(numbers)
+        }
         return replace(self, seen=seen, images=kept)
 
     def fields(self) -> dict[str, Tensor]:

@@ -9,11 +9,14 @@ import numpy as np
 from vla_eval.checkpoints.bases import no_weights
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.checkpoints.trained_with import refuse_differences
-from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
+from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, MemoryArrays, ObservationWindow
+from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.agents.network import AgentNetwork, load_network, read_about
 from vla_eval.policies.agents.observing import action_space, as_action, reader_of
 from vla_eval.policies.context import PolicyContext
 from vla_eval.specs import PolicySpec
+
+LSTM_STATE = ("policy/hidden", "policy/cell")
 
 
 class AgentPolicy:
@@ -24,6 +27,8 @@ class AgentPolicy:
         self._read, self._network, self._about = reader.read, network, about
         self._action, self._task = context.env.action, context.env.task
         self._memory: dict[int, Any] = {}
+        # (layers, 1, units) of a network that remembers
+        self._memory_shape: tuple[int, ...] | None = getattr(network, "lstm_hidden_state_shape", None)
         self.spec = PolicySpec(
             name=context.name,
             reads="every",
@@ -31,6 +36,7 @@ class AgentPolicy:
             states=reader.states,
             chunk_size=about.chunk_size,
             privileged=reader.privileged,
+            has_memory=self._memory_shape is not None,
         )
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
@@ -42,6 +48,27 @@ class AgentPolicy:
         """Release the memory of these slots."""
         for slot in slots:
             self._memory.pop(slot, None)
+
+    def get_memory(self, slot: int) -> dict[str, FloatArray]:
+        """Return the state of the actor's LSTM, each part (layers, 1, units) float32; nothing without one."""
+        if self._memory_shape is None:
+            return {}
+        begun = [np.zeros(self._memory_shape, np.float32)] * len(LSTM_STATE)
+        kept = self._memory[slot] or begun
+        return {name: np.array(part) for name, part in zip(LSTM_STATE, kept, strict=True)}
+
+    def set_memory(self, slot: int, memory: MemoryArrays) -> None:
+        """Put a memory in place of that of a slot's episode."""
+        expected = {} if self._memory_shape is None else dict.fromkeys(LSTM_STATE, self._memory_shape)
+        found = {
+            name: part.shape if part.dtype == np.float32 else part.dtype for name, part in memory.items()
+        }
+        if found != expected:
+            raise SpecMismatchError(
+                f"policy '{self.spec.name}', set_memory: expected float32 {expected}, found {found}. Give it "
+                "what `get_memory` of the same policy returned."
+            )
+        self._memory[slot] = tuple(np.array(memory[name]) for name in expected) or None
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Return the action for the last observation."""

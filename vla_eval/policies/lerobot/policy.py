@@ -20,14 +20,16 @@ from vla_eval.checkpoints.loading import LoadedPolicy, LoadOptions, load_checkpo
 from vla_eval.checkpoints.plain_errors import plain_errors
 from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, history, noise_shape
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
-from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
+from vla_eval.core import ActionChunk, EpisodeStart, MemoryArrays, ObservationWindow
 from vla_eval.errors import InvalidActionError, SpecMismatchError
-from vla_eval.features import ACTION_KEY, CAMERA_KEYS, PROPRIO_STATES, StateKind
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, PROPRIO_STATES, STATE_KEY, StateKind
 from vla_eval.models.episodes.memory import memory_of, recall, remembers, remembers_in_rows, remembers_singly
+from vla_eval.models.episodes.named_memory import MemoryLayout
 from vla_eval.models.episodes.running import (
     Episode,
     Frame,
     batch_of,
+    begun_queues,
     frames_in_time,
     given_noise,
     in_rows,
@@ -105,6 +107,7 @@ class LeRobotPolicy:
         self._batch = batch and (n_slots > 1 or not self._remembers)
         self._n_slots, self._is_compiled = n_slots, is_compiled
         self._slots: dict[int, Episode] = {}
+        self._layout = self._memory_layout(name)
         self._readings = Readings()
         self.readings = self._readings.known
         self.proprioception = inputs.state
@@ -116,6 +119,7 @@ class LeRobotPolicy:
             states=PROPRIO_STATES if inputs.state is not None else (),
             chunk_size=chunk_size(loaded.config),
             reads_committed=joining is not None,
+            has_memory=self._layout is not None and not self._layout.is_empty,
         )
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
@@ -127,6 +131,39 @@ class LeRobotPolicy:
         """Release the frames and the memory of these slots."""
         for slot in slots:
             self._slots.pop(slot, None)
+
+    def get_memory(self, slot: int) -> MemoryArrays:
+        """Return what is kept of a slot's episode; see `MemoryLayout` for the names."""
+        return self._readable().arrays(self._slots[slot])
+
+    def set_memory(self, slot: int, memory: MemoryArrays) -> None:
+        """Put a memory in place of that of a slot's episode."""
+        self._slots[slot] = self._readable().replaced(self._slots[slot], memory)
+
+    def _readable(self) -> MemoryLayout:
+        if self._layout is None:
+            raise SpecMismatchError(
+                f"policy '{self.spec.name}' (type '{self._loaded.config.type}') has `remember` but no "
+                "`begin_memory`, which says what its memory is: it can be neither read nor replaced. Add the "
+                "method (docs/lerobot_policies.md)."
+            )
+        return self._layout
+
+    def _memory_layout(self, name: str) -> MemoryLayout | None:
+        """Return what is kept between inferences; None: what the policy keeps is not known."""
+        policy = self._loaded.policy
+        if self._remembers and not remembers_in_rows(policy):
+            return None
+        fields = (*self._inputs.cameras.values(), *([] if self._inputs.state is None else [STATE_KEY]))
+        return MemoryLayout(
+            policy=name,
+            begun=memory_of(policy.begin_memory(1), 0) if self._remembers else None,
+            has_axis=not self._batch and not remembers_singly(policy),
+            queues=begun_queues(policy) if self._by_step else None,
+            n_frames=-min(self._deltas, default=0),
+            fields=fields,
+            has_earlier=self._earlier is not None,
+        )
 
     def warm_up(self, env: EnvSpec, sentences: Sequence[str]) -> Compilation | None:
         """Compile for these sentences, in the thread that will ask it; None: it is not to be compiled."""
