@@ -14,9 +14,18 @@ from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple
 
-from vla_eval.core import ActionChunk, BatchPolicy, EpisodeStart, ForgettingPolicy, ObservationWindow, Policy
+from vla_eval.core import (
+    ActionChunk,
+    BatchPolicy,
+    EpisodeStart,
+    ForgettingPolicy,
+    MemoryArrays,
+    ObservationWindow,
+    Policy,
+    RememberingPolicy,
+)
 from vla_eval.episode_log import chunk_problem
-from vla_eval.errors import InvalidActionError, VlaEvalError
+from vla_eval.errors import InvalidActionError, SpecMismatchError, VlaEvalError
 from vla_eval.seeding import seed_global_generators
 from vla_eval.serving.metrics import ServerMetrics
 from vla_eval.workers.messages import describe_error
@@ -48,11 +57,18 @@ class _Infer:
     done: Future[Inference] = field(default_factory=Future)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Memory:
+    slot: int
+    memory: MemoryArrays | None  # what is put in place of the slot's; None: it is read
+    done: Future[MemoryArrays | None] = field(default_factory=Future)
+
+
 class PolicyFailure(VlaEvalError):
     """The policy raised an exception; it is the cause."""
 
 
-_Request = _Begin | _Infer
+_Request = _Begin | _Infer | _Memory
 
 
 class Batcher:
@@ -90,6 +106,10 @@ class Batcher:
         request = _Infer(slot=window.slot, start=start, window=window, asked_at=time.monotonic())
         return self._put(request).done
 
+    def memory(self, slot: int, memory: MemoryArrays | None) -> Future[MemoryArrays | None]:
+        """Replace what the policy remembers of a slot, or read it if None is given."""
+        return self._put(_Memory(slot=slot, memory=memory)).done
+
     def forget(self, slot: int) -> None:
         """Have the policy forget a slot, after what was asked for it before."""
         self._put(_Begin(slot=slot, start=None))
@@ -105,7 +125,7 @@ class Batcher:
         self._thread.join(seconds)
         return not self._thread.is_alive()
 
-    def _put[R: (_Begin, _Infer)](self, request: R) -> R:
+    def _put[R: (_Begin, _Infer, _Memory)](self, request: R) -> R:
         with self._changed:
             if self._is_closed:
                 request.done.cancel()
@@ -131,10 +151,12 @@ class Batcher:
             for request in chosen:
                 if not request.done.set_running_or_notify_cancel():
                     continue  # its client is gone
-                if not isinstance(request, _Infer):
+                if isinstance(request, _Begin):
                     self._prepare(request)
                 elif request.slot in self._unready:
                     request.done.set_exception(self._unready[request.slot])
+                elif isinstance(request, _Memory):
+                    self._remember(request)
                 else:
                     due.append(request)
             if due:
@@ -153,6 +175,22 @@ class Batcher:
         else:
             self._unready.pop(request.slot, None)
             request.done.set_result(None)
+
+    def _remember(self, request: _Memory) -> None:
+        policy, found = self._policy, None
+        try:
+            if not isinstance(policy, RememberingPolicy) or not policy.spec.has_memory:
+                raise SpecMismatchError(f"policy '{policy.spec.name}' has no memory to read or to replace.")
+            if request.memory is None:
+                found = policy.get_memory(request.slot)
+            else:
+                policy.set_memory(request.slot, request.memory)
+        except SpecMismatchError as exc:
+            request.done.set_exception(exc)
+        except BaseException as exc:  # as above
+            request.done.set_exception(self._failure(exc, "inference"))
+        else:
+            request.done.set_result(found)
 
     def _failure(self, exc: BaseException, stage: Literal["reset", "inference"]) -> PolicyFailure:
         error = describe_error(exc, stage)

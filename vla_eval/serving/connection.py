@@ -12,7 +12,7 @@ from typing import Any, cast  # Any: what a client sends
 from websockets.asyncio.server import ServerConnection
 from websockets.exceptions import ConnectionClosed
 
-from vla_eval.core import EpisodeStart
+from vla_eval.core import EpisodeStart, MemoryArrays
 from vla_eval.errors import VlaEvalError, did_you_mean
 from vla_eval.serving.asked_sentences import AskedSentences
 from vla_eval.serving.batching import Batcher, Inference
@@ -21,14 +21,14 @@ from vla_eval.serving.sessions import Session, SessionTable
 from vla_eval.strict.json_text import shown
 from vla_eval.wire.client import READING_KEY
 from vla_eval.wire.codec import CodecError, packb, unpackb
-from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.wire.metadata import GET_MEMORY, MEMORY, SET_MEMORY, ServerMetadata, memory_problem
 
-ENDPOINTS = ("infer", "reset", "observe")
+ENDPOINTS = ("infer", "reset", "observe", GET_MEMORY, SET_MEMORY)
 MAX_PENDING = 1024  # requests of a connection without a reply
 INTERNAL_ERROR = 1011  # close code of RFC 6455, as openpi's server uses it
 MAX_ERROR_CHARACTERS = 4000
 
-_Done = Future[Inference] | Future[None]
+_Done = Future[Inference] | Future[None] | Future[MemoryArrays | None]
 
 logger = logging.getLogger(__name__)
 
@@ -95,6 +95,11 @@ class ClientConnection:
             if session.episode is None:
                 raise RequestError("'observe' without an episode. Send 'reset' first.")
             sessions.observe(session, request)
+        elif endpoint in (GET_MEMORY, SET_MEMORY):
+            memory = _memory(request) if endpoint == SET_MEMORY else None
+            if session.episode is None:
+                raise RequestError(f"'{endpoint}' without an episode. Send 'reset' first.")
+            self._answer_later(session, request, batcher.memory(session.slot, memory), begun)
         else:
             if sessions.begins(session, request):
                 batcher.begin(self._begin(session, request))  # if it fails, so does the inference
@@ -123,11 +128,14 @@ class ClientConnection:
     ) -> None:
         """Send the reply to a request once the policy has answered."""
         try:
-            result = await asyncio.wrap_future(cast("Future[Inference | None]", done))
-            reset_ms = 1000 * (time.monotonic() - begun)
-            reply = {"status": "reset", "server_timing": {"reset_ms": reset_ms}}
-            if result is not None:
+            result = await asyncio.wrap_future(cast("Future[Inference | MemoryArrays | None]", done))
+            endpoint = request.get("endpoint")
+            ms = 1000 * (time.monotonic() - begun)
+            reply: dict[str, Any] = {"status": endpoint, "server_timing": {f"{endpoint}_ms": ms}}
+            if isinstance(result, Inference):
                 reply = self._chunk_reply(result, session, start)
+            elif result is not None:
+                reply[MEMORY] = _sound_memory(result)
             echo = {key: request[key] for key in ("session_id", "step") if request.get(key) is not None}
             await self._socket.send(packb({**reply, **echo}))
             self._previous_seconds = time.monotonic() - begun
@@ -165,6 +173,20 @@ class ClientConnection:
             await self._socket.close(INTERNAL_ERROR, "error")
         except ConnectionClosed:
             pass
+
+
+def _memory(request: Mapping[str, Any]) -> MemoryArrays:
+    problem = memory_problem(request.get(MEMORY))
+    if problem is not None:
+        raise RequestError(f"'{MEMORY}': {problem}.")
+    return cast(MemoryArrays, request[MEMORY])
+
+
+def _sound_memory(memory: MemoryArrays) -> dict[str, Any]:
+    problem = memory_problem(memory)
+    if problem is not None:
+        raise RequestError(f"the policy's memory cannot be sent: {problem}.")
+    return dict(memory)
 
 
 def _read(data: str | bytes) -> dict[str, Any]:

@@ -44,7 +44,7 @@ from vla_eval.strict.bounds import MAX_SERVER_ROWS, MAX_STEPS, check_bounds
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import robot_task, task_spec
 from vla_eval.tasks.interface import ANY_TASK, IMAGE_SIZE, env_spec
-from vla_eval.wire.metadata import PROTOCOL, SUPPORTS, ServerMetadata
+from vla_eval.wire.metadata import MEMORY, PROTOCOL, SUPPORTS, ServerMetadata
 
 OWN_PACKAGE = "mikasa-vla-eval"
 
@@ -229,7 +229,7 @@ def _describe(
         needs_every_frame=policy.spec.reads == "every",
         needs_session_id=True,
         batch_max=options.max_batch if isinstance(policy, BatchPolicy) else 1,
-        supports=SUPPORTS,
+        supports=(*SUPPORTS, MEMORY) if policy.spec.has_memory else SUPPORTS,
         versions={name: version for name, version in versions.items() if version is not None},
         training_seeds=training_seeds(recipe.value.adapter, recipe.value.args) or None,
         sentences=training_sentences(recipe.value.adapter, recipe.value.args),

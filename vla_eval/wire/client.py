@@ -7,10 +7,10 @@ share a connection, and answers come in the order of completion. On any other, a
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Protocol  # Any: a message may hold anything
 
-from vla_eval.core import EpisodeStart
+from vla_eval.core import EpisodeStart, MemoryArrays
 from vla_eval.strict.json_text import shown
 from vla_eval.wire.connection import Connection
-from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.wire.metadata import GET_MEMORY, MEMORY, SET_MEMORY, ServerMetadata
 
 READING_KEY = "sentence_read"
 """Of an answer of this wire: what the policy has read of the sentence, where that is new."""
@@ -47,12 +47,15 @@ class PolicyClient(Protocol):
     def take_reading(self, session: str) -> Any:
         """Return what the last answer said of how the sentence was read, unchecked; None: nothing."""
 
+    def ask_memory(self, session: str, memory: MemoryArrays | None) -> Any:
+        """Replace the memory of a session; None: return it, unchecked."""
+
     def close(self) -> None:
         """Close the connection."""
 
 
 class _Question(NamedTuple):
-    """What an answer is waited for: `reset` or `infer`, at which control step."""
+    """What an answer is waited for: which endpoint, at which control step."""
 
     endpoint: str
     step: int
@@ -132,6 +135,19 @@ class OpenpiClient:
     def take_reading(self, session: str) -> Any:
         """Return what a server of this wire reported on the sentence, unchecked; None: nothing new."""
         return self._readings.pop(session, None) if self._metadata.is_ours else None
+
+    def ask_memory(self, session: str, memory: MemoryArrays | None) -> Any:
+        """Replace the memory of a session; None: return it, unchecked."""
+        endpoint = GET_MEMORY if memory is None else SET_MEMORY
+        if MEMORY not in self._metadata.supports:
+            raise self._connection.refuse(f"'{endpoint}': expected a server that supports '{MEMORY}'")
+        given = {} if memory is None else {MEMORY: dict(memory)}
+        self._asked[session] = _Question(endpoint, 0)
+        self._connection.send({**given, **self._address(session, endpoint, step=0)})
+        answer = self._answer(session)
+        if answer.get("status") != endpoint:
+            raise self._connection.refuse(f"expected the status '{endpoint}', found {shown(answer)}")
+        return answer.get(MEMORY)
 
     def close(self) -> None:
         """Close the connection."""

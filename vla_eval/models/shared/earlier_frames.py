@@ -105,12 +105,20 @@ class FrameMemory:
         images = {camera: arrays[f"images/{camera}"] for camera in self.cameras if len(numbers)}
         problems = (
             (bool(set(arrays) - known), f"expected {', '.join(sorted(known))}, found {', '.join(arrays)}"),
-            (arrays["n_frames"].shape != () or arrays["n_frames"].dtype.kind != "i", "n_frames is no number"),
+            (
+                arrays["n_frames"].shape != ()
+                or arrays["n_frames"].dtype.kind != "i"
+                or arrays["n_frames"] < 0,
+                "n_frames is no number of frames",
+            ),
             (
                 [block.shape for block in blocks] not in ([], [(3, n, n) for n in BLOCKS]),
                 "the blocks have other shapes",
             ),
-            (events.ndim != 2 or events.shape[1:] != (2,), f"expected events (N, 2), found {events.shape}"),
+            (
+                events.ndim != 2 or events.shape[1:] != (2,) or not np.isfinite(events).all(),
+                f"expected finite events (N, 2), found {events.shape}",
+            ),
             (numbers.ndim != 1 or numbers.dtype.kind != "i", "the numbers of images are no list of numbers"),
             (
                 any(
@@ -127,6 +135,8 @@ class FrameMemory:
             blocks=blocks or None,
             events=tuple(Event(int(number), float(changed)) for number, changed in events),
         )
+        if seen.n_frames and not self.choice.wanted(seen) <= set(numbers.tolist()):
+            raise ValueError(f"expected images of the frames {sorted(self.choice.wanted(seen))}")
         kept = {
             int(number): {camera: torch.from_numpy(array[i].copy()) for camera, array in images.items()}
             for i, number in enumerate(numbers)

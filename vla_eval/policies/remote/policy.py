@@ -9,8 +9,8 @@ import numpy as np
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.files import digest_of
-from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
-from vla_eval.errors import RemoteChangedError, SpecMismatchError
+from vla_eval.core import ActionChunk, EpisodeStart, MemoryArrays, ObservationWindow
+from vla_eval.errors import RemoteChangedError, RemoteReplyError, SpecMismatchError
 from vla_eval.models.shared.sentence_reading import SentenceReading, from_wire
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.remote.actions import as_rows, converted
@@ -20,7 +20,13 @@ from vla_eval.policies.remote.settings import RemoteSettings, remote_settings
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.wire.addresses import split_urls
 from vla_eval.wire.client import PolicyClient
-from vla_eval.wire.metadata import COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY, ServerMetadata
+from vla_eval.wire.metadata import (
+    COMMITTED_ACTIONS_KEY,
+    COMMITTED_FROZEN_KEY,
+    MEMORY,
+    ServerMetadata,
+    memory_problem,
+)
 
 SESSION_BYTES = 8
 
@@ -75,6 +81,21 @@ class RemotePolicy:
                 request[COMMITTED_FROZEN_KEY] = window.committed.n_frozen
             client.ask_infer(session, request, step=last.step)
         return [self._answer(window.slot) for window in windows]
+
+    def get_memory(self, slot: int) -> MemoryArrays:
+        """Return what the server's policy keeps of a slot's episode."""
+        memory = self._clients[slot].ask_memory(self._sessions[slot], None)
+        problem = memory_problem(memory)
+        if problem is not None:
+            raise RemoteReplyError(f"policy '{self.spec.name}': the server's '{MEMORY}': {problem}.")
+        return {name: np.array(part) for name, part in memory.items()}
+
+    def set_memory(self, slot: int, memory: MemoryArrays) -> None:
+        """Put a memory in place of that of a slot's episode."""
+        problem = memory_problem(memory)
+        if problem is not None:
+            raise SpecMismatchError(f"policy '{self.spec.name}', set_memory: {problem}.")
+        self._clients[slot].ask_memory(self._sessions[slot], memory)
 
     def close(self) -> None:
         """Close the connections."""
@@ -135,6 +156,7 @@ def make_remote(
         states=fitted.states,
         chunk_size=fitted.chunk_size,
         reads_committed=metadata.chunking_mode is not None,
+        has_memory=metadata.is_ours and MEMORY in metadata.supports,
     )
     return RemotePolicy(spec=spec, clients=clients, fit=fitted, settings=settings, action=context.env.action)
 

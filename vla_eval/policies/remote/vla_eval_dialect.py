@@ -11,7 +11,7 @@ import time
 from collections.abc import Mapping
 from typing import Any  # Any: a message may hold anything
 
-from vla_eval.core import EpisodeStart
+from vla_eval.core import EpisodeStart, MemoryArrays
 from vla_eval.errors import RemoteReplyError
 from vla_eval.policies.remote.settings import RemoteSettings
 from vla_eval.strict.json_text import shown
@@ -78,6 +78,10 @@ class VlaEvalClient:
 
     def take_reading(self, session: str) -> Any:
         """Return None: these servers say nothing of sentences."""
+
+    def ask_memory(self, session: str, memory: MemoryArrays | None) -> Any:
+        """Refuse: these servers have no such message."""
+        raise RemoteReplyError(f"{self._connection.url}: this server has no messages for a memory.")
 
     def close(self) -> None:
         """Close the connection."""
