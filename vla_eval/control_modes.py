@@ -70,6 +70,9 @@ CONTROL_MODES: Mapping[str, ActionSpec] = MappingProxyType(
 )
 """Mode -> its action. Positions in m and rotations in rad (XYZ Euler angles) in the frame of the base."""
 
+RELATIVE_MODES = (EE_DELTA_POSE, EE_DELTA_POS, JOINT_DELTA_POS)
+"""Modes whose actions are motions from where the arm is: one that is skipped is lost."""
+
 
 def action_spec(mode: str) -> ActionSpec:
     """Return what an action of a mode is."""

@@ -24,7 +24,7 @@ Stage = Literal["setup", "reset", "step", "inference"]
 FloatArray = NDArray[np.float32]
 ImageArray = NDArray[np.uint8]
 MemoryArrays = Mapping[str, NDArray[Any]]
-"""What a policy keeps of an episode, by name; which names, dtypes and shapes is the policy's own affair."""
+"""What a policy keeps of an episode, by name; which names, dtypes and shapes is up to the policy."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

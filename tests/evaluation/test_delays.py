@@ -9,6 +9,7 @@ from tests.evaluation import evaluation_bench
 from tests.evaluation.evaluation_bench import TASK, Bench
 from tests.evaluation.resolved import fingerprint, make_plan
 from vla_eval.cli.main import main
+from vla_eval.control_modes import CONTROL_MODES
 from vla_eval.errors import RecipeError, RunChangedError
 
 pytestmark = pytest.mark.usefixtures("light_workers")
@@ -89,7 +90,7 @@ class TestTraces:
             chunking={"delay": {"trace": str(pair.folder / "drawn")}}, n_action_steps=[2], episodes=6
         )
 
-        (note,) = make_plan(config).notes
+        note, _lost = make_plan(config).notes
         assert "drawn has 2 of these 6 episodes" in note
 
     def test_a_run_is_not_continued_with_another_trace_of_the_same_name(self, pair: Bench) -> None:
@@ -120,8 +121,29 @@ def test_it_is_said_where_a_measured_delay_is_that_of_several_episodes(pair: Ben
     def notes(**fields: Any) -> list[str]:
         return make_plan(pair.config(chunking={"delay": "measured"}, **fields)).notes
 
-    assert notes() == []
+    assert "share passes" not in " ".join(notes())
     assert "share passes" in " ".join(notes(slots_per_worker=2))
+
+
+@pytest.mark.parametrize("mode", CONTROL_MODES)
+@pytest.mark.parametrize(
+    ("chunking", "skips"),
+    [
+        ({}, False),
+        ({"delay": 1}, True),
+        ({"delay": {"steps": [0, 2]}}, True),
+        ({"delay": "measured"}, True),
+        ({"delay": 1, "delay_alignment": "stale"}, False),
+        ({"delay": 1, "mode": "wait"}, False),
+    ],
+)
+def test_it_is_said_where_a_delay_makes_motion_get_lost(
+    pair: Bench, mode: str, chunking: dict[str, Any], skips: bool
+) -> None:
+    notes = make_plan(pair.config(chunking=chunking, env={"control_mode": mode})).notes
+    said = [note for note in notes if "motion that is lost" in note]
+    assert len(said) == (skips and "delta" in mode)
+    assert all(mode in note for note in said)
 
 
 def test_a_delay_that_is_a_number_is_recorded_as_before_it_could_vary(bench: Bench) -> None:

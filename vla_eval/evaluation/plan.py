@@ -18,6 +18,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.prompts import PromptRecipe, load_prompts, sentences_of
+from vla_eval.control_modes import RELATIVE_MODES
 from vla_eval.cue_view import CueViewSettings
 from vla_eval.envs.factory import describe_env
 from vla_eval.errors import RecipeError
@@ -100,7 +101,8 @@ class Plan:
         parts = dict.fromkeys(group.part for group in self._groups)
         unknown = [part for part in parts if part in self.sentences and self.sentences[part] is None]
         replayed = [] if self.delays is None else [self.delays.note([job.key for job in self.jobs])]
-        return [*(about_nothing_known(part) for part in unknown), *replayed, *self.about_measured]
+        nothing_known = [about_nothing_known(part) for part in unknown]
+        return [*nothing_known, *replayed, *self.about_measured, *self.about_skipped]
 
     @property
     def about_measured(self) -> list[str]:
@@ -111,6 +113,23 @@ class Plan:
         return [
             "chunking.delay is measured, and episodes share passes of the policy: the delay of each is that "
             "of the whole pass. For that of a robot: workers=1, slots_per_worker=1, inference=in_process."
+        ]
+
+    @property
+    def about_skipped(self) -> list[str]:
+        """A note where a delay makes motion get lost."""
+        modes = dict.fromkeys(
+            group.offered.action.control_mode
+            for group in self._groups
+            if group.rollout.chunking.delay != 0
+            and group.rollout.chunking.is_aligned
+            and group.offered.action.control_mode in RELATIVE_MODES
+        )
+        return [
+            f"chunking.delay with delay_alignment=skip: actions of {mode} are relative, and what is skipped "
+            "is motion that is lost: arms stop before the target. delay_alignment=stale executes it late; "
+            "pd_joint_pos and pd_ee_pose have absolute targets (docs/real_time.md#relative-actions)."
+            for mode in modes
         ]
 
     @property
