@@ -123,16 +123,34 @@ def test_a_policy_without_a_memory_and_a_session_without_an_episode_are_refused(
                 assert isinstance(said, str) and why in said
 
 
-@pytest.mark.parametrize("memory", [None, 3, {"a": "b"}, {"a": [1.0]}, {"a": np.array(["x"])}])
-def test_a_server_that_sends_no_memory_is_refused(memory: Any) -> None:
+@contextmanager
+def answering(reply: dict[str, Any]) -> Iterator[str]:
+    """Serve someone who announces a memory and, asked for it, answers this."""
     server = SmallServer(supports=[*OURS["supports"], "memory"])
 
     def answer(request: dict[str, Any]) -> Any:
-        echo = {key: request[key] for key in ("session_id", "step")}
-        return {**echo, "status": request["endpoint"], "memory": memory}
+        if request["endpoint"] != "memory/get":
+            return server.usual_answer(request)
+        return {**reply, **{key: request[key] for key in ("session_id", "step")}}
 
     server.answer = answer
     with small_serving(server) as url:
+        yield url
+
+
+@pytest.mark.parametrize("status", [None, "reset", "memory/set", 3, np.zeros(2), ["memory/get"]])
+def test_a_server_that_answers_something_else_is_refused(status: Any) -> None:
+    with answering({"status": status, "memory": {}}) as url:
+        policy = make_remote(context_for(make_env(small_checkpoints.FAKE).spec), url=url)
+        policy.reset([start(0, seed=1)])
+        with pytest.raises(RemoteReplyError, match="expected the status 'memory/get'"):
+            policy.get_memory(0)
+        policy.close()
+
+
+@pytest.mark.parametrize("memory", [None, 3, {"a": "b"}, {"a": [1.0]}, {"a": np.array(["x"])}])
+def test_a_server_that_sends_no_memory_is_refused(memory: Any) -> None:
+    with answering({"status": "memory/get", "memory": memory}) as url:
         policy = make_remote(context_for(make_env(small_checkpoints.FAKE).spec), url=url)
         policy.reset([start(0, seed=1)])
         with pytest.raises(RemoteReplyError, match="memory"):

@@ -145,7 +145,8 @@ class OpenpiClient:
         self._asked[session] = _Question(endpoint, 0)
         self._connection.send({**given, **self._address(session, endpoint, step=0)})
         answer = self._answer(session)
-        if answer.get("status") != endpoint:
+        status = answer.get("status")
+        if not (isinstance(status, str) and status == endpoint):
             raise self._connection.refuse(f"expected the status '{endpoint}', found {shown(answer)}")
         return answer.get(MEMORY)
 
