@@ -10,12 +10,11 @@ import pytest
 from websockets.sync.client import connect
 
 from tests.checkpoints import small_checkpoints
-from tests.checkpoints.small_checkpoints import context_for, observation, save, start, with_features
-from tests.policies.test_memory_arrays import config_of, two_slots
+from tests.checkpoints.small_checkpoints import context_for, save, start, with_features
+from tests.policies.test_memory_arrays import at, config_of, two_slots
 from tests.serving.served_policies import CountingPolicy, Running, frame, serving
 from tests.wire.small_servers import OURS, SmallServer
 from tests.wire.small_servers import serving as small_serving
-from vla_eval.core import ObservationWindow
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RemoteReplyError
 from vla_eval.policies.lerobot.policy import make_lerobot
@@ -41,14 +40,11 @@ def served(checkpoint: Path) -> Iterator[Running]:
         yield running
     finally:
         running.stop()
+        running.wait()
 
 
 def remote(server: Any, env: EnvSpec) -> RemotePolicy:
     return make_remote(two_slots(env), url=server.url)
-
-
-def at(step: int) -> ObservationWindow:
-    return ObservationWindow(slot=0, frames=(observation(step, level=100 + 20 * step),))
 
 
 def test_a_served_policy_keeps_the_contract_of_a_memory(gru: Path, env: EnvSpec) -> None:
