@@ -169,6 +169,13 @@ class BatchPolicy(Policy, Protocol):
         """Decide for each window; the order of the answers is that of the windows."""
 
 
+def infer(policy: Policy, windows: Sequence[ObservationWindow]) -> list[ActionChunk]:
+    """Return the chunks of a policy for some windows, in one call if it can."""
+    if isinstance(policy, BatchPolicy):
+        return policy.act_batch(windows)
+    return [policy.act(window) for window in windows]
+
+
 @runtime_checkable
 class ForgettingPolicy(Policy, Protocol):
     """A policy that can release the memory of an episode that is over, before the next `reset`."""

@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 from vla_eval.chunking import ChunkExecutor, ChunkingSpec
 from vla_eval.core import (
-    BatchPolicy,
     EpisodeStart,
     FloatArray,
     ObservationWindow,
@@ -21,6 +20,7 @@ from vla_eval.core import (
     Stage,
     StepObserver,
     StepResult,
+    infer,
 )
 from vla_eval.cue_view import AS_SHOWN, CueBoxes, CueView, CueViewSettings, cue_locator
 from vla_eval.episode_log import EpisodeLog, check_chunk, check_execution, check_start
@@ -161,10 +161,7 @@ class _Loop:
         windows = [self._window(episode) for episode in due]
         self.heartbeat("inference")
         began = time.perf_counter()
-        if isinstance(self.policy, BatchPolicy):
-            chunks = self.policy.act_batch(windows)
-        else:
-            chunks = [self.policy.act(window) for window in windows]
+        chunks = infer(self.policy, windows)
         seconds = time.perf_counter() - began
         for episode, window, chunk in zip(due, windows, chunks, strict=True):
             check_chunk(chunk, self.policy.spec, self.env.spec.action, episode.log)

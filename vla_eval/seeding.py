@@ -31,6 +31,7 @@ class Stream(IntEnum):
     SHUFFLE = 10
     AGENT = 11
     DELAY = 12
+    MEMORY = 13
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

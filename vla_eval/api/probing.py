@@ -1,7 +1,6 @@
 """`vla_eval.run_probe`: `mikasa-vla probe` from Python, also for a policy that is a Python object."""
 
-import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any  # policies are whatever the user gives; plain data
@@ -11,15 +10,16 @@ from markupsafe import Markup
 from vla_eval.api.configured import listed
 from vla_eval.api.evaluating import entries_of, eval_config, run_or_resume
 from vla_eval.api.run import Text, in_colors, notebook_html
-from vla_eval.cli.probe import EPISODES, INTERVENTIONS, OUT, probe_settings
+from vla_eval.cli.probe import EPISODES, INTERVENTIONS, OUT, all_worlds, probe_settings
 from vla_eval.cli.shared.evaluations import in_turn
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.policies.entries import PolicyEntry
+from vla_eval.policies.entries import PolicyEntry, load_policy_entry
 from vla_eval.probe.interventions import plan_probe
 from vla_eval.probe.page.retention_plot import write_retention
 from vla_eval.probe.page.sections import retention_plots
 from vla_eval.probe.probe_text import render_probe
 from vla_eval.probe.table import ProbeTable, read_probe
+from vla_eval.probe.worlds import World
 from vla_eval.results.formats import Format
 from vla_eval.strict.calls import public
 
@@ -92,9 +92,8 @@ def run_probe(
     entries = entries_of(policy)
     start = {"name": "probe", "episodes": EPISODES}
     read = eval_config(config, entries, {"tasks": tasks, **given}, where="run_probe", start=start)
-    probe = plan_probe(read, probe_settings(chosen, controls=controls))
-    for pair in probe.left_out:
-        print(f"left out: {pair}", file=sys.stderr)
+    settings = probe_settings(chosen, controls=controls)
+    probe = plan_probe(read, settings)
     objects = {one.name: one for one in entries if isinstance(one, PolicyEntry)}
 
     def run(folder: Path, config: EvalConfig) -> None:
@@ -107,6 +106,16 @@ def run_probe(
             command="vla_eval.run_probe(…)",
         )
 
-    in_turn([(Path(out) / world.config.name, world.config) for world in probe.worlds], run)
-    found = read_probe(probe.worlds, Path(out))
+    def name_of(policy: str) -> str:
+        return policy if policy in objects else load_policy_entry(policy).name
+
+    worlds: list[World] = []
+
+    def folders() -> Iterator[tuple[Path, EvalConfig]]:
+        for world in all_worlds(read, settings, probe, Path(out), name_of):
+            worlds.append(world)
+            yield Path(out) / world.config.name, world.config
+
+    in_turn(folders(), run)
+    found = read_probe(worlds, Path(out))
     return ProbeResult(out=Path(out), found=found, plots=tuple(write_retention(found, Path(out))))

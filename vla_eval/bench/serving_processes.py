@@ -16,7 +16,7 @@ import psutil
 import torch
 
 from vla_eval.chunking import ChunkingSpec
-from vla_eval.core import BatchPolicy, EpisodeStart, FloatArray, Observation, ObservationWindow, Policy
+from vla_eval.core import EpisodeStart, FloatArray, Observation, ObservationWindow, Policy, infer
 from vla_eval.errors import RemotePolicyError
 from vla_eval.lock.switch import own_need
 from vla_eval.policies.context import PolicyContext
@@ -63,10 +63,7 @@ class Asker:
             state={name: drawn.state[name] for name in spec.states},
         )
         self._step += 1
-        window = ObservationWindow(slot=0, frames=(frame,))
-        if isinstance(self._policy, BatchPolicy):
-            return self._policy.act_batch([window])[0].actions
-        return self._policy.act(window).actions
+        return infer(self._policy, [ObservationWindow(slot=0, frames=(frame,))])[0].actions
 
 
 def _drawn(draws: np.random.Generator) -> Observation:

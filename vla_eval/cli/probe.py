@@ -1,8 +1,9 @@
 """`mikasa-vla probe`: what a policy remembers, for how long, and whether it acts on it."""
 
 import argparse
+import math
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,8 @@ from vla_eval.workers.needed_files import Needed
 
 if TYPE_CHECKING:
     from vla_eval.probe.grid import GridSettings
-    from vla_eval.probe.worlds import ProbeSettings
+    from vla_eval.probe.interventions import Probe
+    from vla_eval.probe.worlds import ProbeSettings, World
 
 DESCRIPTION = """Run each task as it is and with one thing changed, on the same seeds, and compare.
 
@@ -36,6 +38,8 @@ mask: part of the image is hidden. late: nothing is shown before the cue. cue, d
 phase. delay_swap: a swap after each delay. distractor: another item is seen in the delay. interference: the
 arm is moved in the delay. reset: the policy is reset in mid-episode. instruction: other sentences.
 appearance: light, camera, colours.
+transplant: the memory of the swapped world is put in. carry_over: that of the episode before. memory_noise,
+hold_memory, stale_memory, erase_memory: the memory has noise, is no longer updated, is old, lacks a part.
 
 With --grid, chunk lengths against the lengths of the phases: what of the cue falls into an inference?
 
@@ -87,6 +91,10 @@ INTERVENTIONS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
         *("reset_steps", int, "S"),
         "control steps (the end of the cue, the beginning of the response)",
     ),
+    "--noise": ("noises", float, "D", "of a memory: standard deviations (0.5 1 2 4)"),
+    "--hold-at": ("hold_steps", int, "S", "control steps from which a memory is held (as --reset-at)"),
+    "--age": ("ages", int, "L", "of a stale memory: control steps (5 10 20)"),
+    "--erase": ("erased", str, "PART", "of a memory (each)"),
     "--latency": ("latencies", int, "L", "of a grid: control steps of an inference (0 1 2 4 8)"),
     "--mode": ("modes", str, "M", "of a grid of latencies: chunking.mode (receding_horizon wait)"),
     "--first-inference": (
@@ -97,7 +105,7 @@ INTERVENTIONS: dict[str, tuple[str, Callable[[str], Any], str, str]] = {
 """Flag -> name, type and metavar of its value, and its help."""
 LEAST = {
     **{"swaps": 1, "delays": 0, "cues": 1, "lates": 1, "distractors": 1, "reset_steps": 1},
-    **{"first_inferences": 0, "latencies": 0},
+    **{"hold_steps": 0, "ages": 1, "noises": 0.0, "first_inferences": 0, "latencies": 0},
 }
 """Least number of the flags that take numbers."""
 OF_GRIDS_ALONE = ("latencies", "modes", "first_inferences")
@@ -113,10 +121,16 @@ def run(args: argparse.Namespace) -> int:
     for flag, (name, *_) in INTERVENTIONS.items():
         if name in OF_GRIDS_ALONE and getattr(args, name) is not None:
             raise RecipeError(f"{flag} is of a grid. Add --grid.")
-    probe = plan_probe(_config(args), _settings(args))
-    for pair in probe.left_out:
-        print(f"left out: {pair}", file=sys.stderr)
-    stopped = _run_all([world.config for world in probe.worlds], args)
+    config, settings = _config(args), _settings(args)
+    probe = plan_probe(config, settings)
+    worlds: list[World] = []
+
+    def in_turn() -> Iterator[EvalConfig]:
+        for world in all_worlds(config, settings, probe, shard_folder(args.out, args.shard), _name_of):
+            worlds.append(world)
+            yield world.config
+
+    stopped = _run_all([world.config for world in probe.worlds], args, in_turn=in_turn())
     if stopped is not None:
         return stopped
     # What draws takes half a second to import, which a mistake need not wait for.
@@ -124,11 +138,42 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.probe.probe_text import render_probe
     from vla_eval.probe.table import read_probe
 
-    table = read_probe(probe.worlds, args.out)
+    table = read_probe(worlds, args.out)
     for path in write_retention(table, args.out):
         print(f"retention curve: {path}", file=sys.stderr)
     print_in(args.format, render_probe(table, args.format))
     return EXIT_EPISODE_ERRORS if table.n_errors else 0
+
+
+def all_worlds(
+    config: EvalConfig,
+    settings: "ProbeSettings",
+    probe: "Probe",
+    out: Path,
+    name_of: Callable[[str], str],
+) -> Iterator["World"]:
+    """Yield the worlds of a probe, each once the others before it were run; say what makes no sense.
+
+    Arguments as for `plan_later`.
+    """
+    from vla_eval.probe.interventions import plan_later
+
+    _say_left_out(probe)
+    yield from probe.worlds
+    later = plan_later(config, settings, probe, out, name_of)
+    _say_left_out(later)
+    yield from later.worlds
+
+
+def _say_left_out(probe: "Probe") -> None:
+    for line in probe.left_out:
+        print(f"left out: {line}", file=sys.stderr)
+
+
+def _name_of(policy: str) -> str:
+    from vla_eval.policies.entries import load_policy_entry
+
+    return load_policy_entry(policy).name
 
 
 def _settings(args: argparse.Namespace) -> "ProbeSettings":
@@ -145,8 +190,9 @@ def probe_settings(chosen: Mapping[str, Any], *, controls: bool) -> "ProbeSettin
     settings: dict[str, Any] = {  # Any: tuples of words or numbers
         name: _numbers(values, name) for name, values in numbers.items()
     }
-    if chosen.get("instructions") is not None:
-        settings["instructions"] = tuple(dict.fromkeys(chosen["instructions"]))
+    for name in ("instructions", "erased"):
+        if chosen.get(name) is not None:
+            settings[name] = tuple(dict.fromkeys(chosen[name]))
     for name, known, kind in (
         ("probes", INTERVENTIONS, "probe"),
         ("masks", MASKS, "mask"),
@@ -191,13 +237,14 @@ def _names(
     return None if words is None else tuple(dict.fromkeys(words))
 
 
-def _numbers(values: list[int] | None, name: str) -> tuple[int, ...] | None:
+def _numbers(values: list[float] | None, name: str) -> tuple[float, ...] | None:
     if values is None:
         return None
     flag = next(flag for flag, (dest, *_) in INTERVENTIONS.items() if dest == name)
     for value in values:
-        if value < LEAST[name]:
-            raise RecipeError(f"{flag} {value}: expected a whole number ≥ {LEAST[name]}.")
+        if not LEAST[name] <= value < math.inf:
+            kind = "whole number" if isinstance(LEAST[name], int) else "number"
+            raise RecipeError(f"{flag} {value}: expected a {kind} ≥ {LEAST[name]:g}.")
     return tuple(dict.fromkeys(values))
 
 
@@ -234,13 +281,18 @@ def _shortest_chunk(config: EvalConfig) -> int | None:
     return min((size for policy in policies for size in chunk_sizes(policy)), default=None)
 
 
-def _run_all(configs: Sequence[EvalConfig], args: argparse.Namespace) -> int | None:
-    """Run or resume each evaluation, or one shard of each; return the exit code after a shard or a signal."""
+def _run_all(
+    configs: Sequence[EvalConfig], args: argparse.Namespace, *, in_turn: Iterable[EvalConfig] | None = None
+) -> int | None:
+    """Run or resume each evaluation, or one shard of each; return the exit code after a shard or a signal.
+
+    `in_turn`: those that are run, where more than `configs` become known on the way, of the same policies.
+    """
     from vla_eval.cli.shared.evaluations import evaluate_each
     from vla_eval.cli.shared.output import print_shard
 
     out = shard_folder(args.out, args.shard)
-    runs = ((out / config.name, config) for config in configs)
+    runs = ((out / config.name, config) for config in (configs if in_turn is None else in_turn))
     with backend_of(args, needs=lambda: _needed(configs)) as backend:
         done = evaluate_each(runs, args, backend=backend)
     if done.stopped is not None:

@@ -9,6 +9,7 @@ from vla_eval.config.environment import AS_DESIGNED, AppearanceSettings, RenderS
 from vla_eval.config.files import check_run_name
 from vla_eval.cue_view import CueViewKind
 from vla_eval.errors import RecipeError
+from vla_eval.memory_change import MemoryChange
 from vla_eval.strict.bounds import (
     MAX_EPISODES,
     MAX_SERVER_ROWS,
@@ -146,6 +147,7 @@ class EvalConfig:
     stop_at_success: bool = False
     reset_policy_at_step: Steps | None = None
     cue_view: CueViewKind = "as_shown"
+    memory_change: MemoryChange | None = None
     eager_rendering: bool = False
     slots_per_worker: Slots = 1
     inference: Literal["auto", "in_process", "shared"] = "auto"

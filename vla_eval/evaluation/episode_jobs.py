@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from vla_eval.config.environment import EnvSettings
+from vla_eval.memory_change import MemoryChange
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.specs import EnvSpec
@@ -38,6 +39,7 @@ class EpisodeGroup:
     n_candidates: int  # what the task lets one choose among; 0 where nothing is chosen
     rollout: RolloutSettings
     instruction: str
+    memory_change: MemoryChange | None = None  # what is changed of the policy's memory
     # how many episodes a forward pass of the policy has room for: the slots of a worker where the policy
     # is in it, else what its server says
     n_rows: int = 1

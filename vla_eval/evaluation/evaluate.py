@@ -21,7 +21,7 @@ from vla_eval.evaluation.job_queue import EpisodeBatch, JobQueue
 from vla_eval.evaluation.plan import Plan, make_plan
 from vla_eval.evaluation.resolve import ResolvedEvaluation
 from vla_eval.evaluation.server_phases import ReadyPhase, phases, with_servers
-from vla_eval.evaluation.worker import Finished, NetworkCompiled, SentenceRead
+from vla_eval.evaluation.worker import Finished, MemoryFound, NetworkCompiled, SentenceRead
 from vla_eval.models.shared.sentence_reading import SentenceWatch
 from vla_eval.policies.registry import own_modules
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
@@ -200,7 +200,8 @@ def _runner(bookkeeper: "_Bookkeeper") -> RunnerClass:
     if config.capture.is_on:
         folder = bookkeeper.folder.path.resolve()
         capture = EpisodeCapture(config=config.capture, folder=folder, seed_start=config.seed_start)
-    return RunnerClass(target=RUNNER, options={"capture": capture})
+    asks_memory = config.world is not None and config.memory_change is None
+    return RunnerClass(target=RUNNER, options={"capture": capture, "asks_memory": asks_memory})
 
 
 def _run(
@@ -222,6 +223,8 @@ def _run(
                 bookkeeper.observer.on_device(event.device)
             elif isinstance(event, NetworkCompiled):
                 bookkeeper.folder.note(event.note)
+            elif isinstance(event, MemoryFound):
+                bookkeeper.folder.note_memory(event.policy, event.parts)
             elif isinstance(event, SentenceRead):
                 bookkeeper.note_sentence(event)
             else:

@@ -219,6 +219,7 @@ def _groups_of_all(
             offered=offered,
             n_candidates=task.n_candidates(config.env),
             instruction=sentences_of(prompts, task)[0],
+            memory_change=config.memory_change,
         )
         for policy in (policy for policy in policies if policy.task in (None, task.id)):
             check_adapter(policy.value.adapter)

@@ -94,12 +94,20 @@ def check_changes(config: EvalConfig, task: TaskSpec, env: EnvSpec) -> None:
         )
     if CueViewSettings(kind=view).hides and task.is_official:
         raise no_cue_locator(view, task.id)
-    if reset_step is not None and reset_step >= env.horizon_steps:
-        raise TaskArgumentError(
-            f"reset_policy_at_step={reset_step}: {task.id}: the episode ends after "
-            f"{env.horizon_steps} steps: nothing would be reset. Use a smaller number, or increase "
-            "env.horizon_steps."
-        )
+    moments = {"reset_policy_at_step": (reset_step, "reset")}
+    if (change := config.memory_change) is not None:
+        moments["memory_change.at_step"] = (change.at_step, "changed")
+        if change.kind == "carry_over" and config.seed_start == 0:
+            raise RecipeError(
+                "memory_change.kind=carry_over: expected a seed_start of 1 or more, found 0: the memory is "
+                "that of the episode with the seed before."
+            )
+    for name, (step, happens) in moments.items():
+        if step is not None and step >= env.horizon_steps:
+            raise TaskArgumentError(
+                f"{name}={step}: {task.id}: the episode ends after {env.horizon_steps} steps: nothing would "
+                f"be {happens}. Use a smaller number, or increase env.horizon_steps."
+            )
 
 
 def check_runs(config: EvalConfig, policies: Sequence[PolicyEntry]) -> None:

@@ -95,6 +95,8 @@ class ResolvedEvaluation:
         data["chunking"] = recorded_chunking(config.chunking, data["chunking"])
         if config.cue_view == "as_shown":
             del data["cue_view"]
+        if config.memory_change is None:
+            del data["memory_change"]
         if config.appearance == AS_DESIGNED:
             del data["appearance"]
         return data

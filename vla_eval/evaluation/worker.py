@@ -8,7 +8,7 @@ import dataclasses
 import functools
 import gc
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from vla_eval.config.environment import EnvSettings
@@ -23,8 +23,10 @@ from vla_eval.errors import (
     SpecMismatchError,
     VlaEvalError,
 )
+from vla_eval.evaluation.donors import donor_memories, donor_settings
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
+from vla_eval.memory_change import ChangedMemory, memory_parts
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.policies.compiled import CompiledPolicy
 from vla_eval.policies.context import PolicyContext
@@ -63,6 +65,14 @@ class SentenceRead(Notice):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MemoryFound(Notice):
+    """The parts of a policy's memory that can be erased; none if it has no memory."""
+
+    policy: str
+    parts: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkCompiled(Notice):
     """The network of a policy was compiled; the note says how far its actions differ."""
 
@@ -86,13 +96,19 @@ class EpisodeRunner:
     """Runs episodes of one group, keeping environment and policy."""
 
     def __init__(
-        self, heartbeat: Heartbeat, tell: Callable[[Notice], None], capture: EpisodeCapture | None = None
+        self,
+        heartbeat: Heartbeat,
+        tell: Callable[[Notice], None],
+        capture: EpisodeCapture | None = None,
+        asks_memory: bool = False,
     ) -> None:
         self._capture = capture
+        self._asks_memory = asks_memory  # of the policy; False once the parent knows
         self._heartbeat = heartbeat
         self._tell = tell
         self._env: SimEnv | None = None
         self._filming_env: SimEnv | None = None
+        self._donor_env: SimEnv | None = None
         self._policy: Policy | None = None
         self._n_told = 0  # sentences that the parent knows of
 
@@ -124,10 +140,10 @@ class EpisodeRunner:
 
     def close(self) -> None:
         """Release the simulator."""
-        for env in (self._env, self._filming_env):
+        for env in (self._env, self._filming_env, self._donor_env):
             if env is not None:
                 env.close()
-        self._env = self._filming_env = self._policy = None
+        self._env = self._filming_env = self._donor_env = self._policy = None
 
     def _run(self, env: SimEnv, policy: Policy, batch: EpisodeBatch) -> Finished:
         group = batch.group
@@ -143,12 +159,15 @@ class EpisodeRunner:
             )
             for job in batch.jobs
         ]
-        # By the episode of slot 0, even if it has a result already and is not in the batch.
-        seed_global_generators("episodes", group.key.task, batch.jobs[0].run, starts[0].seed - starts[0].slot)
+        changed = self._with_changed_memory(policy, group, starts)
+        _seed_generators(starts)
         tapes = self._capture.tapes(starts, with_images=self._is_live(group)) if self._capture else None
         count = _StepCount(self._heartbeat, functools.partial(self._tell_sentences, group, policy))
         observers: list[StepObserver] = [count, *([tapes] if tapes else [])]
-        records = rollout(env, policy, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
+        records = rollout(env, changed, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
+        if self._asks_memory:
+            self._asks_memory = False
+            self._tell(MemoryFound(policy=group.key.policy, parts=memory_parts(policy, starts[0])))
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
         timings = self._heartbeat.timings([job.key for job in batch.jobs])
@@ -163,6 +182,25 @@ class EpisodeRunner:
                 film=lambda tape: tape if self._is_live(group) else self._filmed(tape, group),
             )
         return Finished(records=named, timings=timings)
+
+    def _with_changed_memory(
+        self, policy: Policy, group: EpisodeGroup, starts: Sequence[EpisodeStart]
+    ) -> Policy:
+        """Return the policy as these episodes ask it: with the memory of others put in, for example."""
+        change = group.memory_change
+        if change is None:
+            return policy
+        if not change.has_donor:
+            return ChangedMemory(policy, change)
+        if self._donor_env is None:
+            self._heartbeat("setup")
+            settings = donor_settings(self._settings_for(group, policy), change)
+            self._donor_env = self._make_env(settings, group.offered)
+        _seed_generators(starts)
+        donors = donor_memories(
+            self._donor_env, policy, starts, group.rollout, change, heartbeat=self._heartbeat
+        )
+        return ChangedMemory(policy, change, donors)
 
     def _is_live(self, group: EpisodeGroup) -> bool:
         """Whether images are captured while episodes run."""
@@ -229,6 +267,12 @@ class EpisodeRunner:
         if device := describe_device(env):
             self._tell(DeviceFound(device=device))
         return env
+
+
+def _seed_generators(starts: Sequence[EpisodeStart]) -> None:
+    """Seed them by the episode of slot 0, even if it has a result already and is not in the batch."""
+    first = starts[0]
+    seed_global_generators("episodes", first.task, first.run, first.seed - first.slot)
 
 
 def make_policy(group: EpisodeGroup) -> Policy:

@@ -12,7 +12,7 @@ from vla_eval.probe.grid import AXES, GridWorld, named_grid_world
 from vla_eval.probe.grid_table import GridTable, grid_table
 from vla_eval.probe.interventions import INTERVENTIONS, named_world
 from vla_eval.probe.phases import fixed_phases
-from vla_eval.probe.table import ProbeTable, policy_order, probe_table
+from vla_eval.probe.table import ProbeTable, policy_order, table_of_runs
 from vla_eval.probe.world_records import by_policy
 from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.results.grouping import config_names
@@ -42,10 +42,7 @@ class FoundProbe:
 
     def table(self) -> ProbeTable:
         """Return the table of the worlds, as `mikasa-vla probe` prints it."""
-        order = policy_order([one.run for one in self.worlds])
-        return probe_table(
-            [one.world for one in self.worlds], [one.run.records for one in self.worlds], order=order
-        )
+        return table_of_runs([one.world for one in self.worlds], [one.run for one in self.worlds])
 
     def grid_table(self) -> GridTable:
         """Return the table of the grid, as `mikasa-vla probe --grid` prints it."""

@@ -9,6 +9,7 @@ from vla_eval.config.environment import AS_DESIGNED
 from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.errors import RecipeError
 from vla_eval.probe.worlds import APPEARANCES, AS_DRAWN, Intervention, ProbeSettings, TaskWorlds, World
+from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import robot_task
 
 OWN_ARGUMENTS = (
@@ -18,9 +19,12 @@ OWN_ARGUMENTS = (
 OWN_FIELDS: Mapping[str, object] = {
     "reset_policy_at_step": None,
     "cue_view": "as_shown",
+    "memory_change": None,
     "appearance": AS_DESIGNED,
 }
 """Fields of an evaluation that a probe changes, and their values in the world as drawn."""
+
+NO_MEMORY = "no policy has a memory that can be changed"
 
 LEAST_MOTION_STEPS = 2
 """One step out and one back."""
@@ -35,6 +39,9 @@ class Rule(NamedTuple):
     # Swaps have a sentence of their own.
     clause: str = ""
     needs_phases: bool = True  # whether it makes no sense for tasks without phases
+    of_memory: bool = (
+        False  # whether it changes a policy's memory: who has one is known after the first world
+    )
 
 
 INTERVENTIONS: Mapping[Intervention, Rule] = {
@@ -100,7 +107,10 @@ INTERVENTIONS: Mapping[Intervention, Rule] = {
         "after a motion of the arm in the delay in",
     ),
     "reset": Rule(
-        lambda of: [of.world("reset", step, reset_policy_at_step=step) for step in of.reset_steps()],
+        lambda of: [
+            of.world("reset", step, reset_policy_at_step=step)
+            for step in of.steps_of(of.settings.reset_steps)
+        ],
         "it has no phases; name the steps with --reset-at",
         "after a reset of its memory at step {level} in",
         needs_phases=False,
@@ -125,6 +135,48 @@ INTERVENTIONS: Mapping[Intervention, Rule] = {
         "with another {level} in",
         needs_phases=False,
     ),
+    "transplant": Rule(
+        TaskWorlds.transplanted,
+        NO_MEMORY,
+        "with the memory of the swapped cue {level} put in at the response in",
+        of_memory=True,
+    ),
+    "carry_over": Rule(
+        lambda of: of.changed("carry_over", at_step=0),
+        NO_MEMORY,
+        "beginning with the memory that the episode before left in",
+        of_memory=True,
+    ),
+    "memory_noise": Rule(
+        lambda of: [w for d in of.settings.noises for w in of.changed("memory_noise", f"{d:g}", dose=d)],
+        NO_MEMORY,
+        "with noise of {level} standard deviations in its memory in",
+        of_memory=True,
+    ),
+    "hold_memory": Rule(
+        lambda of: [
+            w
+            for step in of.steps_of(of.settings.hold_steps)
+            for w in of.changed("hold_memory", step, at_step=step)
+        ],
+        NO_MEMORY,
+        "with the memory of step {level} from there on in",
+        of_memory=True,
+    ),
+    "stale_memory": Rule(
+        lambda of: [
+            w for age in of.settings.ages for w in of.changed("stale_memory", age, at_step=0, age_steps=age)
+        ],
+        NO_MEMORY,
+        "with its memory of {level} steps before in",
+        of_memory=True,
+    ),
+    "erase_memory": Rule(
+        TaskWorlds.erased,
+        "no policy has such a part of its memory",
+        "without '{level}' of its memory at the response in",
+        of_memory=True,
+    ),
 }
 
 
@@ -146,27 +198,81 @@ class Probe:
     left_out: tuple[str, ...]
 
 
-def plan_probe(config: EvalConfig, settings: ProbeSettings) -> Probe:
-    """Return the evaluations of a probe: the configured one, in each world that the settings name."""
+def plan_probe(
+    config: EvalConfig,
+    settings: ProbeSettings,
+    *,
+    memories: Mapping[str, Mapping[str, tuple[str, ...]]] | None = None,
+) -> Probe:
+    """Return the evaluations of a probe: the configured one, in each world that the settings name.
+
+    Args:
+        config: the configured evaluation.
+        settings: which worlds.
+        memories: task -> policy of the configuration -> the parts of its memory. None: not known yet, so that
+            the worlds with a changed memory are not among those that are returned.
+    """
     refuse_own_arguments(config)
     worlds: list[World] = []
     left_out: list[str] = []
     for task in config.tasks:
         spec = robot_task(task, does="`probe` changes")
-        of_task = TaskWorlds(spec=spec, config=config, settings=settings)
+        known = None if memories is None else memories.get(spec.id, {})
+        of_task = TaskWorlds(spec=spec, config=config, settings=settings, memories=known)
         changed: list[World] = []
+        is_asked = False  # whether the world as drawn is needed to know who remembers
         for probe in settings.probes:
             rule = INTERVENTIONS[probe]
-            found = rule.worlds(of_task) if of_task.has_phases or not rule.needs_phases else []
+            is_possible = of_task.has_phases or not rule.needs_phases
+            found = rule.worlds(of_task) if is_possible else []
             changed += found
-            if not found:
-                left_out.append(f"{probe} on {spec.id}: {rule.why_not}")
-        if changed:
+            if is_possible and rule.of_memory and known is None:
+                is_asked = True
+            elif not any(world.intervention == probe for world in found):
+                why = rule.why_not if is_possible or not rule.of_memory else "it has no phases"
+                left_out.append(f"{probe} on {spec.id}: {why}")
+        if changed or is_asked:
             # By name: `delay_swap` has the worlds of `swap` and `delay` that it is compared with.
             worlds += {one.config.name: one for one in (of_task.world(AS_DRAWN, None), *changed)}.values()
     if not worlds:
         raise RecipeError(f"--probe: there is nothing to run ({'; '.join(left_out)}).")
     return Probe(worlds=tuple(worlds), left_out=tuple(left_out))
+
+
+def plan_later(
+    config: EvalConfig, settings: ProbeSettings, first: Probe, out: Path, name_of: Callable[[str], str]
+) -> Probe:
+    """Return the worlds with a changed memory, and what makes no sense: known once the first were run.
+
+    Args:
+        config: as for `plan_probe`.
+        settings: as for `plan_probe`.
+        first: what `plan_probe` has returned.
+        out: the folder of the run folders.
+        name_of: what records call a policy of the configuration.
+    """
+    if not any(INTERVENTIONS[probe].of_memory for probe in settings.probes):
+        return Probe(worlds=(), left_out=())
+    memories: dict[str, Mapping[str, tuple[str, ...]]] = {}
+    unknown: list[str] = []
+    for world in first.worlds:
+        if world.intervention == AS_DRAWN:
+            found = read_run(out / world.config.name).description.memories
+            named = {policy: name_of(policy) for policy in config.policies}
+            memories[world.task] = {policy: found[name] for policy, name in named.items() if name in found}
+            unknown += [
+                f"{name} on {world.task}, worlds with a changed memory: whether it has one is not known, "
+                f"since no episode has ended in {out / world.config.name} yet, or one of an earlier version has. "
+                "Remove that folder to run it again."
+                for name in named.values()
+                if name not in found
+            ]
+    later = plan_probe(config, settings, memories=memories)
+    names = {world.config.name for world in first.worlds}
+    return Probe(
+        worlds=tuple(world for world in later.worlds if world.config.name not in names),
+        left_out=(*unknown, *(line for line in later.left_out if line not in first.left_out)),
+    )
 
 
 def refuse_own_arguments(config: EvalConfig) -> None:

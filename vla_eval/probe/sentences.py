@@ -10,7 +10,7 @@ from vla_eval.probe.retention import HalfLife
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeRow, ProbeTable
 from vla_eval.probe.text_table import error_notes
-from vla_eval.probe.worlds import AS_DRAWN, CONTROLS, CONTROLS_OF_ONE, SWAPS
+from vla_eval.probe.worlds import AS_DRAWN, CONTROLS, CONTROLS_OF_ONE, SWAPS, WITHOUT_MEMORY
 
 LEAST_MISTAKES = 5  # with fewer, their kinds say nothing
 
@@ -34,6 +34,8 @@ def _sentence(table: ProbeTable, task: str, policy: str, k: int) -> str:
 
 
 def _clause(row: ProbeRow) -> str | None:
+    if row.intervention == WITHOUT_MEMORY:
+        return "keeps no memory that could be changed"
     if row.swap is not None:
         what = "both orders" if row.intervention == "order" else "the cue in both worlds"
         after = f" after a delay of {row.level} steps" if row.intervention == "delay_swap" else ""
@@ -48,7 +50,8 @@ def _clause(row: ProbeRow) -> str | None:
         where = INTERVENTIONS[row.intervention].clause.format(level=row.level)
     chance = "" if row.chance is None else f" (chance {row.chance * row.followed.of:.0f})"
     idle = f", touching nothing in {row.n_without_choice}" if row.n_without_choice else ""
-    return f"{where} {_of(row.followed)}{chance}{idle}{_over_delay(row)}"
+    put_in = f", and that memory in {_of(row.followed_memory)}" if row.followed_memory else ""
+    return f"{where} {_of(row.followed)}{chance}{put_in}{idle}{_over_delay(row)}"
 
 
 def _over_delay(row: ProbeRow) -> str:
@@ -127,6 +130,11 @@ def _columns(rows: Sequence[ProbeRow]) -> Iterator[str]:
             "touched; Rotate: the final angle; other tasks without candidates: the trajectory); "
             "warranted: the cue is followed in both worlds; value: mean success of both worlds; reliable: "
             "success in both."
+        )
+    if any(row.followed_memory for row in rows):
+        yield (
+            "memory: share of episodes whose first choice is right by the memory that was put in, of those "
+            "in which the cue makes another one right."
         )
     if any(row.kept for row in rows):
         yield "kept: items that are remembered, corrected for guessing."

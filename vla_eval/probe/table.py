@@ -1,18 +1,36 @@
 """The table of a probe, from its run folders: a row per task, policy, n_action_steps and world."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
 from vla_eval.probe.quantities import Pair, Share, SwapQuantities, follows, pair_up, paired_p, swap_quantities
 from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
-from vla_eval.probe.world_records import Records, Worlds, by_policy, chance_of, compared_with, results_of
-from vla_eval.probe.worlds import AS_DRAWN, SWAPS, Intervention, Level, World, delay_of, label_of
+from vla_eval.probe.world_records import (
+    Records,
+    Worlds,
+    by_policy,
+    chance_of,
+    compared_with,
+    donor_targets,
+    results_of,
+)
+from vla_eval.probe.worlds import (
+    AS_DRAWN,
+    SWAPS,
+    WITHOUT_MEMORY,
+    Intervention,
+    Level,
+    World,
+    delay_of,
+    label_of,
+)
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import holm
 from vla_eval.results.grouping import config_names
@@ -46,6 +64,8 @@ class ProbeRow:
     over_delay: Contrast | None
     # share of following that this world leaves, and its interval; None for swaps and `none`
     left: tuple[float, Range] | None
+    # episodes that follow the memory that was put in, of those in which it is another one than the cue's
+    followed_memory: Share | None
     # exact paired test against that world; corrected_p: after Holm, over the table
     p_value: float | None
     corrected_p: float | None
@@ -72,8 +92,21 @@ class ProbeTable:
 
 def read_probe(worlds: Sequence[World], out: Path) -> ProbeTable:
     """Read the run folders of all worlds and return their table."""
-    runs = [read_run(out / world.config.name) for world in worlds]
-    return probe_table(worlds, [run.records for run in runs], order=policy_order(runs))
+    return table_of_runs(worlds, [read_run(out / world.config.name) for world in worlds])
+
+
+def table_of_runs(worlds: Sequence[World], runs: Sequence[StoredRun]) -> ProbeTable:
+    """Return the table of worlds and their runs."""
+    changed = {world.task for world in worlds if _is_of_memory(world)}
+    without_memory = {
+        (world.task, policy)
+        for world, run in zip(worlds, runs, strict=True)
+        for policy, parts in run.description.memories.items()
+        if world.task in changed and not parts
+    }
+    return probe_table(
+        worlds, [run.records for run in runs], order=policy_order(runs), without_memory=without_memory
+    )
 
 
 def policy_order(runs: Sequence[StoredRun]) -> tuple[str, ...]:
@@ -84,9 +117,16 @@ def policy_order(runs: Sequence[StoredRun]) -> tuple[str, ...]:
 
 
 def probe_table(
-    worlds: Sequence[World], records: Sequence[Sequence[EpisodeRecord]], *, order: Sequence[str] = ()
+    worlds: Sequence[World],
+    records: Sequence[Sequence[EpisodeRecord]],
+    *,
+    order: Sequence[str] = (),
+    without_memory: Collection[tuple[str, str]] = (),
 ) -> ProbeTable:
-    """Return the table of worlds, `none` of each task first, policies in this order, then by name."""
+    """Return the table of worlds, `none` of each task first, policies in this order, then by name.
+
+    `without_memory`: (task, policy) for which a row says that there is no memory that could be changed.
+    """
     by_world = [(world, by_policy(found)) for world, found in zip(worlds, records, strict=True)]
     drawn = {world.task: found for world, found in by_world if world.intervention == AS_DRAWN}
     ranks = {name: rank for rank, name in enumerate(order)}
@@ -95,8 +135,11 @@ def probe_table(
         of_task = [(world, found) for world, found in by_world if world.task == task]
         # The policies in their order, each by growing n_action_steps.
         for policy, k in sorted(drawn[task], key=lambda key: (ranks.get(key[0], len(ranks)), *key)):
-            own = [_row(world, found, compared_with(world, of_task), policy, k) for world, found in of_task]
-            rows += with_contrasts(own, of_task)
+            ran = [one for one in of_task if (policy, k) in one[1] or not _is_of_memory(one[0])]
+            own = [_row(world, found, of_task, policy, k) for world, found in ran]
+            rows += with_contrasts(own, ran)
+            if (task, policy) in without_memory:
+                rows.append(_row_without_memory(own[0]))
             retention += retention_curves(of_task, policy, k)
     tested = [row.p_value for row in rows if row.p_value is not None]
     corrected = iter(holm(tested))
@@ -104,10 +147,18 @@ def probe_table(
     return ProbeTable(rows=tuple(rows), retention=tuple(retention))
 
 
-def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> ProbeRow:
+def _is_of_memory(world: World) -> bool:
+    return world.intervention != AS_DRAWN and INTERVENTIONS[world.intervention].of_memory
+
+
+def _row(world: World, found: Records, worlds: Worlds, policy: str, k: int) -> ProbeRow:
     own = found.get((policy, k), ())
     results = results_of(own)
-    pairs = pair_up(drawn.get((policy, k), ()), own)
+    pairs = pair_up(compared_with(world, worlds).get((policy, k), ()), own)
+    targets = donor_targets(world, worlds, (policy, k))
+    told_apart = [
+        record for record in results if targets.get((record.run, record.seed)) not in (None, record.target)
+    ]
     choosing = [record for record in results if record.n_candidates]
     is_swap = world.intervention in SWAPS
     swap = swap_quantities(pairs, task_spec(world.task)) if is_swap else None
@@ -131,10 +182,40 @@ def _row(world: World, found: Records, drawn: Records, policy: str, k: int) -> P
         mistakes=mistakes(results, task_spec(world.task)),
         kept=capacity(results),
         over_delay=None,
+        followed_memory=Share.of_records(
+            told_apart, lambda record: record.first_choice == targets[record.run, record.seed]
+        ),
         left=share_left(*_followed(pairs)) if compared and pairs else None,
         p_value=p_value,
         corrected_p=None,
         n_errors=len(own) - len(results),
+    )
+
+
+def _row_without_memory(drawn: ProbeRow) -> ProbeRow:
+    """Return the row that says so, beside a policy's row of the world as drawn."""
+    return ProbeRow(
+        task=drawn.task,
+        policy=drawn.policy,
+        n_action_steps=drawn.n_action_steps,
+        intervention=WITHOUT_MEMORY,
+        level=None,
+        delay_steps=drawn.delay_steps,
+        inferences=None,
+        n_pairs=0,
+        swap=None,
+        followed=None,
+        n_without_choice=None,
+        success=None,
+        chance=None,
+        mistakes=None,
+        kept=None,
+        over_delay=None,
+        left=None,
+        followed_memory=None,
+        p_value=None,
+        corrected_p=None,
+        n_errors=0,
     )
 
 

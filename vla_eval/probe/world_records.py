@@ -29,6 +29,18 @@ def compared_with(world: World, worlds: Worlds) -> Records:
     return next(own, {})
 
 
+def donor_targets(world: World, worlds: Worlds, key: tuple[str, int]) -> dict[tuple[int, int], int | None]:
+    """Return (run, seed) -> what the memory that is put into this episode makes right, of a policy and K."""
+    if world.intervention == "transplant":
+        donors, later = ("swap", world.level), 0
+    elif world.intervention == "carry_over":
+        donors, later = (AS_DRAWN, None), 1
+    else:
+        return {}
+    own = (found for other, found in worlds if (other.intervention, other.level) == donors)
+    return {(one.run, one.seed + later): one.target for one in results_of(next(own, {}).get(key, ()))}
+
+
 def results_of(records: Iterable[EpisodeRecord]) -> list[EpisodeRecord]:
     """Return the records with a result."""
     return [record for record in records if record.outcome != "error"]

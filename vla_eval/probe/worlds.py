@@ -7,12 +7,15 @@ from typing import Any, Literal
 from vla_eval.config.environment import AppearanceSettings
 from vla_eval.config.evaluation import EvalConfig, ProbedWorld
 from vla_eval.cue_view import CueViewKind
+from vla_eval.memory_change import MemoryChange, MemoryChangeKind
 from vla_eval.probe.phases import Phases, default_delay_steps, fixed_phases
 from vla_eval.tasks.spec import TaskSpec
 
 Intervention = str
 """`AS_DRAWN`, or a key of `interventions.INTERVENTIONS`."""
 AS_DRAWN: Intervention = "none"
+WITHOUT_MEMORY: Intervention = "no memory"
+"""In place of one, in the row of a policy without a memory that could be changed."""
 SWAPS: tuple[Intervention, ...] = ("swap", "order", "delay_swap")
 """Interventions whose worlds have another right answer than the world that they are compared with."""
 
@@ -57,6 +60,10 @@ class ProbeSettings:
     # control steps at which the policy is reset; none: the end of the cue, and the beginning of the
     # response if that is later
     reset_steps: tuple[int, ...] = ()
+    noises: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)  # doses, in standard deviations of each array
+    hold_steps: tuple[int, ...] = ()  # from which control steps on a memory is held; none: as `reset_steps`
+    ages: tuple[int, ...] = (5, 10, 20)  # of a stale memory, control steps
+    erased: tuple[str, ...] = ()  # parts of a memory; none: each of its parts
     controls: bool = True
 
 
@@ -90,6 +97,9 @@ class TaskWorlds:
     spec: TaskSpec
     config: EvalConfig
     settings: ProbeSettings
+    # policy of the configuration -> the parts of its memory, none if it has none; None: not known before the
+    # world as drawn has been run
+    memories: Mapping[str, tuple[str, ...]] | None = None
 
     @property
     def has_phases(self) -> bool:
@@ -134,11 +144,40 @@ class TaskWorlds:
         lengths = [length for length in self.settings.distractors if length <= longest]
         return [self.world("distractor", length, {"distract_steps": length}) for length in lengths]
 
-    def reset_steps(self) -> tuple[int, ...]:
-        """Return the steps at which the policy is reset: those asked for, or the ends of phases."""
-        if self.settings.reset_steps or not self.has_phases:
-            return self.settings.reset_steps
+    def steps_of(self, asked: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the steps at which something is done: those asked for, or the ends of phases."""
+        if asked or not self.has_phases:
+            return asked
         return tuple(dict.fromkeys((self.phases.cue_end_step, self.phases.response_step)))
+
+    def transplanted(self) -> list[World]:
+        """Return the worlds with swapped cues, and those in which the memory of these is put in."""
+        swaps = [{"swap_cue": swap} for swap in self.settings.swaps]
+        return [
+            *(self.world("swap", swap["swap_cue"], swap) for swap in swaps),
+            *(w for swap in swaps for w in self.changed("transplant", swap["swap_cue"], donor_env=swap)),
+        ]
+
+    def erased(self) -> list[World]:
+        """Return the worlds in which one part of the memory is missing, of the policies that have it."""
+        known = dict.fromkeys(part for parts in (self.memories or {}).values() for part in parts)
+        parts = [part for part in known if part in (self.settings.erased or known)]
+        return [w for part in parts for w in self.changed("erase_memory", part, part=part)]
+
+    def changed(
+        self, kind: MemoryChangeKind, level: Level = None, *, at_step: int | None = None, **change: Any
+    ) -> list[World]:
+        """Return the world with a changed memory, of the policies that have one; none if no policy has."""
+        part = change.get("part")
+        policies = [
+            policy for policy, parts in (self.memories or {}).items() if parts and part in (None, *parts)
+        ]
+        if not policies:
+            return []
+        moment = self.phases.response_step if at_step is None else at_step
+        changed = MemoryChange(kind=kind, at_step=moment, **change)
+        world = self.world(kind, level, memory_change=changed)
+        return [replace(world, config=replace(world.config, policies=tuple(policies)))]
 
     def world(
         self,
@@ -155,7 +194,10 @@ class TaskWorlds:
         delay = {"delay_steps": default_delay_steps(self.spec)} if self.has_phases else {}
         config = replace(
             self.config,
-            name="_".join([self.spec.id, intervention, *([] if level is None else [str(level)])]),
+            # A part of a memory has a name with a slash.
+            name="_".join(
+                [self.spec.id, intervention, *([] if level is None else [str(level).replace("/", ".")])]
+            ),
             tasks=(self.spec.id,),
             policies=tuple(policies),
             env={**delay, **self.config.env, **(env or {})},

@@ -13,7 +13,7 @@ from vla_eval.storage.run_folder import StoredRun
 
 VARIANT_FIELDS = (
     *("env", "chunking", "render", "stop_at_success", "reset_policy_at_step", "prompt_set", "simulator"),
-    *("sim_backend", "cue_view", "appearance"),
+    *("sim_backend", "cue_view", "memory_change", "appearance"),
 )
 """Fields of a configuration that affect success rates and are not part of an episode's key."""
 

@@ -16,13 +16,13 @@ from typing import Any, Literal, NamedTuple
 
 from vla_eval.core import (
     ActionChunk,
-    BatchPolicy,
     EpisodeStart,
     ForgettingPolicy,
     MemoryArrays,
     ObservationWindow,
     Policy,
     RememberingPolicy,
+    infer,
 )
 from vla_eval.episode_log import chunk_problem
 from vla_eval.errors import InvalidActionError, SpecMismatchError, VlaEvalError
@@ -227,10 +227,7 @@ class Batcher:
         start, step = due[0].start, due[0].window.last.step
         # For policies that draw from generators that all code shares: nothing asked before affects a draw.
         seed_global_generators("served", start.task, start.run, start.seed, step)
-        if isinstance(self._policy, BatchPolicy):
-            chunks = self._policy.act_batch([request.window for request in due])
-        else:
-            chunks = [self._policy.act(request.window) for request in due]
+        chunks = infer(self._policy, [request.window for request in due])
         if len(chunks) != len(due):
             raise ValueError(f"the policy gave {len(chunks)} chunks for {len(due)} windows")
         return chunks

@@ -61,7 +61,9 @@ def continued(
     for change in growth:
         logger.info("%s: the run grows: %s", shown, change)
     if growth:  # the command that makes the whole run is the newest
-        known = replace(known, description=replace(description, environment=old.environment))
+        known = replace(
+            known, description=replace(description, environment=old.environment, memories=old.memories)
+        )
     session = replace(session, environment_changes=changes, plan_changes=growth)
     return replace(known, sessions=(*known.sessions, session))
 

@@ -20,6 +20,7 @@ FORMAT_VERSION = 1
 RUN_FILE = "run.json"
 NOT_SET = "(not set)"
 MAX_LISTED, MAX_LINE = 20, 400  # changes in one message, and characters of each
+SPARSE_FIELDS = ("shard", "training_seeds", "memories")  # of a description; written where they say something
 DEVICE = "device"  # the part of the environment that is known only once a worker has started
 
 type JsonValue = bool | int | float | str | Sequence[JsonValue] | Mapping[str, JsonValue] | None
@@ -42,6 +43,8 @@ class RunDescription:
     shard: Shard | None = None  # which part of the plan it is; None: all of it
     # seeds of the demonstrations that policies were trained on, where known; not compared
     training_seeds: Mapping[str, Mapping[str, tuple[SeedRange, ...]]] = field(default_factory=dict)
+    # policy -> the parts of its memory, of the world as drawn of a probe; not compared
+    memories: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 class Change(NamedTuple):
@@ -113,6 +116,11 @@ class RunFile:
         description = replace(self.description, environment=environment)
         return replace(self, description=description).with_changes(changes)
 
+    def with_memory(self, policy: str, parts: tuple[str, ...]) -> "RunFile":
+        """Return this with the parts of a policy's memory; none for a policy without one."""
+        memories = {**self.description.memories, policy: parts}
+        return replace(self, description=replace(self.description, memories=memories))
+
     def with_changes(self, changes: Sequence[Change]) -> "RunFile":
         """Return this with changes noted in the current session."""
         *earlier, current = self.sessions
@@ -179,7 +187,9 @@ def _session_fields(session: Session) -> dict[str, Any]:  # Any: JSON
 
 def _description(value: RunDescription) -> dict[str, Any]:  # Any: JSON
     # Fields that say nothing are left out, so that earlier versions of this program read the file.
-    own = {name: item for name, item in _fields(value).items() if name not in ("shard", "training_seeds")}
+    own = {name: item for name, item in _fields(value).items() if name not in SPARSE_FIELDS}
+    if value.memories:
+        own["memories"] = value.memories
     if value.shard is not None:
         own["shard"] = asdict(value.shard)
     if value.training_seeds:

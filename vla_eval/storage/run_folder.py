@@ -205,6 +205,10 @@ class RunFolder:
         if not any(line in session.sentences for session in self._run_file.sessions):
             self._keep(self._run_file.with_sentence(line))
 
+    def note_memory(self, policy: str, parts: tuple[str, ...]) -> None:
+        """Record the parts of a policy's memory."""
+        self._keep(self._run_file.with_memory(policy, parts))
+
     def close(self) -> None:
         """Close the files and let other processes in; a second call does nothing."""
         if self._episodes is not None:

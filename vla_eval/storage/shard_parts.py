@@ -55,7 +55,10 @@ def merge_descriptions(parts: Sequence[ShardPart], *, allow_environment_change: 
     environment = without_device(first.run_file.description.environment) | (
         {DEVICE: device} if device else {}
     )
-    description = replace(first.run_file.description, environment=environment, shard=None)
+    memories = {
+        policy: names for part in parts for policy, names in part.run_file.description.memories.items()
+    }
+    description = replace(first.run_file.description, environment=environment, shard=None, memories=memories)
     return RunFile(description=description, sessions=tuple(sessions))
 
 
