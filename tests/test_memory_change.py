@@ -1,7 +1,7 @@
 """A memory that is changed between two inferences, on a policy that writes down when it was asked."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -132,7 +132,7 @@ class TestErase:
 
 
 class TestNoise:
-    MEMORY: MemoryArrays = {
+    MEMORY: ClassVar[MemoryArrays] = {
         "a": np.arange(20_000, dtype=np.float32),
         "b": np.array([1.0, np.inf, -np.inf, np.nan, 3.0]),
         "steps": np.arange(5),

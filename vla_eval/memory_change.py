@@ -64,7 +64,7 @@ class MemoryChange:
 
     kind: MemoryChangeKind
     at_step: Annotated[int, Bounds(0, MAX_STEPS)] = 0
-    donor_env: Mapping[str, Any] | None = None  # arguments of the donor's task that differ
+    donor_env: dict[str, Any] | None = None  # arguments of the donor's task that differ
     dose: Annotated[float, Bounds(0.0, 1000.0)] | None = None
     age_steps: Annotated[int, Bounds(1, MAX_STEPS)] | None = None
     part: str | None = None  # an array, or the part of several names before the first `/`

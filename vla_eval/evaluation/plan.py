@@ -23,6 +23,7 @@ from vla_eval.cue_view import CueViewSettings
 from vla_eval.envs.factory import describe_env
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.delay_trace import RunDelays
+from vla_eval.evaluation.donors import donor_settings
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob, GroupKey
 from vla_eval.evaluation.plan_checks import (
     check_base,
@@ -212,6 +213,8 @@ def _groups_of_all(
         )
         offered = describe_env(env)
         check_changes(config, task, offered)
+        if config.memory_change is not None:
+            describe_env(donor_settings(env, config.memory_change))  # refuses arguments that it does not take
         check_base(config, task)
         on_task = partial(
             EpisodeGroup,

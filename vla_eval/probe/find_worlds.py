@@ -144,7 +144,15 @@ def _with_drawn(found: Sequence[Found[World]]) -> tuple[Found[World], ...]:
     return tuple(sorted(own, key=lambda one: (ranks[one.world.task], *_rank(one.world))))
 
 
-def _rank(world: World) -> tuple[int, int, str]:
+def _rank(world: World) -> tuple[int, float, str]:
     level = world.level
-    number = level if isinstance(level, int) else 0
+    number = level if isinstance(level, int) else _number(level)
     return [AS_DRAWN, *INTERVENTIONS].index(world.intervention), number, str(level)
+
+
+def _number(level: str | None) -> float:
+    """Return the number that a level is, such as a dose; 0 for a name."""
+    try:
+        return float(level or 0)
+    except ValueError:
+        return 0.0

@@ -234,7 +234,7 @@ def plan_probe(
         if changed or is_asked:
             # By name: `delay_swap` has the worlds of `swap` and `delay` that it is compared with.
             worlds += {one.config.name: one for one in (of_task.world(AS_DRAWN, None), *changed)}.values()
-    if not worlds:
+    if not worlds and memories is None:
         raise RecipeError(f"--probe: there is nothing to run ({'; '.join(left_out)}).")
     return Probe(worlds=tuple(worlds), left_out=tuple(left_out))
 
@@ -261,8 +261,8 @@ def plan_later(
             named = {policy: name_of(policy) for policy in config.policies}
             memories[world.task] = {policy: found[name] for policy, name in named.items() if name in found}
             unknown += [
-                f"{name} on {world.task}, worlds with a changed memory: whether it has one is not known, "
-                f"since no episode has ended in {out / world.config.name} yet, or one of an earlier version has. "
+                f"{name} on {world.task}, worlds with a changed memory: whether it has one is not known: in "
+                f"{out / world.config.name} no episode has ended yet, or an earlier version has run it. "
                 "Remove that folder to run it again."
                 for name in named.values()
                 if name not in found

@@ -160,8 +160,8 @@ class TaskWorlds:
 
     def erased(self) -> list[World]:
         """Return the worlds in which one part of the memory is missing, of the policies that have it."""
-        known = dict.fromkeys(part for parts in (self.memories or {}).values() for part in parts)
-        parts = [part for part in known if part in (self.settings.erased or known)]
+        known = {part for parts in (self.memories or {}).values() for part in parts}
+        parts = sorted(known & set(self.settings.erased or known))
         return [w for part in parts for w in self.changed("erase_memory", part, part=part)]
 
     def changed(
