@@ -4,6 +4,7 @@ import contextlib
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import mikasa_vla_client as client  # after the line above
 MEMORY_SPEC = client.PolicySpec(
     name="sums", chunk_size=4, cameras=("base_camera",), state="joints", needs_every_frame=True
 )
+HOLDABLE_SPEC = replace(MEMORY_SPEC, has_memory=True)
 PLAIN_SPEC = client.PolicySpec(name="plain", chunk_size=2, state="eef")
 
 
@@ -31,6 +33,18 @@ class Sums:
     def infer(self, session: Any, observation: Any) -> Any:
         self.observe(session, observation)
         return np.full((4, 7), np.sin(session.memory))
+
+
+class HeldSums(Sums):
+    """The same with a memory that can be read and replaced."""
+
+    def get_memory(self, session: Any) -> Any:
+        return {"sum": np.array([session.memory])}
+
+    def set_memory(self, session: Any, memory: Any) -> None:
+        if set(memory) != {"sum"} or memory["sum"].shape != (1,):
+            raise ValueError(f"expected 'sum' of shape (1,), found {', '.join(memory) or 'nothing'}")
+        session.memory = float(memory["sum"][0])
 
 
 class MixedSums(Sums):

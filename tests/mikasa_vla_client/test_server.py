@@ -12,7 +12,15 @@ import pytest
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
-from tests.mikasa_vla_client.serving import MEMORY_SPEC, PLAIN_SPEC, Sums, client, served
+from tests.mikasa_vla_client.serving import (
+    HOLDABLE_SPEC,
+    MEMORY_SPEC,
+    PLAIN_SPEC,
+    HeldSums,
+    Sums,
+    client,
+    served,
+)
 from vla_eval import features
 from vla_eval.wire.codec import packb, unpackb
 from vla_eval.wire.metadata import ServerMetadata
@@ -209,3 +217,60 @@ class TestRefusals:
             answer = health.getresponse()
             assert (answer.status, answer.read()) == (200, b"OK\n")
             health.close()
+
+
+class TestMemory:
+    def test_it_goes_from_one_session_to_another(self) -> None:
+        with served(HeldSums(), HOLDABLE_SPEC) as url, contextlib.closing(Client(url)) as one:
+            assert "memory" in one.metadata["supports"]
+            for session in ("a", "b"):
+                one.ask(endpoint="reset", session_id=session, seed=3, prompt="p")
+            first = one.ask(**FRAME, session_id="a")["actions"]
+            held = one.ask(endpoint="memory/get", session_id="a")
+            assert held["status"] == "memory/get"
+            second = one.ask(**FRAME, session_id="a")["actions"]
+            assert not np.array_equal(first, second)
+            assert (
+                one.ask(endpoint="memory/set", session_id="b", memory=held["memory"])["status"]
+                == "memory/set"
+            )
+            assert np.array_equal(one.ask(**FRAME, session_id="b")["actions"], second)
+
+    @pytest.mark.parametrize(
+        ("request_", "says"),
+        [
+            ({"endpoint": "memory/get", "session_id": "z"}, "'memory/get' without an episode"),
+            ({"endpoint": "memory/set", "session_id": "z", "memory": {}}, "'memory/set' without an episode"),
+            ({"endpoint": "memory/set"}, "expected a map of at most 1024 arrays, found NoneType"),
+            ({"endpoint": "memory/set", "memory": {"sum": "1"}}, "found 'sum': str"),
+            ({"endpoint": "memory/set", "memory": {}}, "expected 'sum' of shape (1,), found nothing"),
+            ({"endpoint": "memory/set", "memory": {"sum": np.zeros(2)}}, "expected 'sum' of shape (1,)"),
+        ],
+    )
+    def test_what_is_no_memory_is_refused_and_other_sessions_keep_theirs(
+        self, request_: dict[str, Any], says: str
+    ) -> None:
+        with (
+            served(HeldSums(), HOLDABLE_SPEC) as url,
+            contextlib.closing(Client(url)) as other,
+            contextlib.closing(Client(url)) as hostile,
+        ):
+            for one in (other, hostile):
+                one.ask(endpoint="reset", seed=3, prompt="p")
+            kept = other.ask(endpoint="memory/get")["memory"]["sum"]
+            answer = hostile.ask(**request_)
+            assert isinstance(answer, str) and says in answer
+            assert other.ask(endpoint="memory/get")["memory"]["sum"] == kept
+
+    def test_a_policy_without_it_refuses_both(self) -> None:
+        with served(Sums()) as url:
+            for endpoint in ("memory/get", "memory/set"):
+                with contextlib.closing(Client(url)) as one:
+                    assert "memory" not in one.metadata["supports"]
+                    one.ask(endpoint="reset", seed=3, prompt="p")
+                    answer = one.ask(endpoint=endpoint, memory={})
+                    assert answer == f"'{endpoint}': policy 'sums' has no memory that can be read."
+
+    def test_who_announces_a_memory_has_the_methods(self) -> None:
+        with pytest.raises(client.SpecError, match="has no method get_memory"):
+            client.PolicyServer(Sums(), HOLDABLE_SPEC, port=0)

@@ -9,7 +9,16 @@ import numpy as np
 import pytest
 from websockets.sync.server import serve
 
-from tests.mikasa_vla_client.serving import MEMORY_SPEC, PLAIN_SPEC, MixedSums, Sums, client, served
+from tests.mikasa_vla_client.serving import (
+    HOLDABLE_SPEC,
+    MEMORY_SPEC,
+    PLAIN_SPEC,
+    HeldSums,
+    MixedSums,
+    Sums,
+    client,
+    served,
+)
 from vla_eval.errors import ConformanceError
 from vla_eval.testing.check_remote import check_remote
 from vla_eval.wire.codec import packb
@@ -52,6 +61,49 @@ def test_a_policy_with_memory_by_session_passes_and_the_check_says_what_it_tried
     assert "Refused with a text: an image of another shape." in met
     assert "Refused with a text: a state with a number that is infinite." in met
     assert met[-1] == "After refused messages the server answers as before."
+
+
+def test_a_memory_that_can_be_held_is_moved_to_another_session() -> None:
+    with served(HeldSums(), HOLDABLE_SPEC) as url:
+        met = check_remote(url)
+    assert any("continues with the memory that was read, in another session" in claim for claim in met)
+    assert "Refused with a text: a memory for a session without an episode." in met
+
+
+class Incomplete(HeldSums):
+    """Hands out a memory with one fault."""
+
+    def __init__(self, fault: str) -> None:
+        self._fault = fault
+
+    def get_memory(self, session: Any) -> Any:
+        faults: dict[str, Any] = {
+            "rounded": {"sum": np.array([round(session.memory)], np.float64)},
+            "no numbers": {"sum": np.array(["1"])},
+            "no map": [np.zeros(1)],
+            "too large": {"sum": np.zeros((5_000_000,), np.float64)},
+        }
+        return faults.get(self._fault, super().get_memory(session))
+
+    def set_memory(self, session: Any, memory: Any) -> None:
+        if self._fault != "not replaced":
+            super().set_memory(session, memory)
+
+
+@pytest.mark.parametrize(
+    ("fault", "says"),
+    [
+        ("rounded", "its actions are the same. Found: inference"),
+        ("not replaced", "its actions are the same. Found: inference"),
+        ("no numbers", "expected arrays of numbers by name, found 'sum': <U1"),
+        ("no map", "expected a map of at most 1024 arrays, found list"),
+        ("too large", "expected at most 33554432 bytes, found 40000000"),
+    ],
+)
+def test_what_is_wrong_with_a_memory_is_said(fault: str, says: str) -> None:
+    with served(Incomplete(fault), HOLDABLE_SPEC) as url, pytest.raises(ConformanceError) as info:
+        check_remote(url)
+    assert says in str(info.value)
 
 
 def test_a_function_passes() -> None:

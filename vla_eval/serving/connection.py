@@ -21,7 +21,8 @@ from vla_eval.serving.sessions import Session, SessionTable
 from vla_eval.strict.json_text import shown
 from vla_eval.wire.client import READING_KEY
 from vla_eval.wire.codec import CodecError, packb, unpackb
-from vla_eval.wire.metadata import GET_MEMORY, MEMORY, SET_MEMORY, ServerMetadata, memory_problem
+from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.wire.numbers import GET_MEMORY, MEMORY, SET_MEMORY, memory_problem
 
 ENDPOINTS = ("infer", "reset", "observe", GET_MEMORY, SET_MEMORY)
 MAX_PENDING = 1024  # requests of a connection without a reply

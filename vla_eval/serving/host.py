@@ -44,7 +44,8 @@ from vla_eval.strict.bounds import MAX_SERVER_ROWS, MAX_STEPS, check_bounds
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import robot_task, task_spec
 from vla_eval.tasks.interface import ANY_TASK, IMAGE_SIZE, env_spec
-from vla_eval.wire.metadata import MEMORY, PROTOCOL, SUPPORTS, ServerMetadata
+from vla_eval.wire.metadata import PROTOCOL, SUPPORTS, ServerMetadata
+from vla_eval.wire.numbers import MEMORY
 
 OWN_PACKAGE = "mikasa-vla-eval"
 

@@ -15,6 +15,7 @@ import numpy as np
 # Relative: the file is in two packages.
 from .check_client import CheckFailedError, Chunks, Episode, Facts, RefusedError, Server, run_episodes, shown
 from .noise import PAIRS, SEEDS
+from .numbers import MEMORY
 
 __all__ = ["CheckFailedError", "check_remote"]
 
@@ -50,7 +51,7 @@ def check_remote(
     met: list[str] = []
     said = server.first_message()
     is_ours = said.get("protocol") == PROTOCOL
-    checks = [_healthz, _metadata, _chunks, _layouts, _seeds, _sessions, _resets, _refusals]
+    checks = [_healthz, _metadata, _chunks, _layouts, _seeds, _sessions, _resets, _memories, _refusals]
     for check in checks if is_ours else [_plain]:
         for claim in check(server):
             met.append(claim)
@@ -205,6 +206,33 @@ def _resets(server: Server) -> list[str]:
     return [_expect_same(server, after, 1, "`reset` forgets the session's earlier episode.", BY_SESSION)]
 
 
+def _memories(server: Server) -> list[str]:
+    """Continue an episode in another session, with the memory that it had."""
+    if MEMORY not in server.facts.supports:
+        return []
+    moved = (
+        "An episode continues with the memory that was read, in another session: its actions are the same."
+    )
+    for n_asked in (0, 1, 2):
+        with server.connect() as connection:
+            first, second = (Episode(server, connection, 1, session_id=name) for name in "ab")
+            first.begin()
+            for _ in range(n_asked):
+                first.ask()
+                first.answer()
+            second.begin()
+            # So that what is kept of this session beside the memory would be that of another moment.
+            second.ask()
+            second.answer()
+            second.continue_from(first)
+            while len(second.chunks) < len(server.alone[1]):
+                second.ask()
+                second.answer()
+        advice = "Let `get_memory` return all that is kept of the episode between two inferences."
+        _expect_same(server, second.chunks, 1, moved, advice)
+    return [moved]
+
+
 def _bad_messages(facts: Facts) -> dict[str, Any]:
     """Return description -> a message that has to be refused."""
     good = facts.observation(1, 0)
@@ -215,6 +243,9 @@ def _bad_messages(facts: Facts) -> dict[str, Any]:
         "an endpoint that does not exist": {**good, "endpoint": "jump"},
         "an episode without an instruction": {k: v for k, v in good.items() if k != facts.prompt_key},
     }
+    if MEMORY in facts.supports:
+        begun = {**good, "endpoint": "memory/set"}
+        bad["a memory for a session without an episode"] = {**begun, MEMORY: {}}
     if image is not None:
         bad["a missing image"] = {key: value for key, value in good.items() if key != image}
         bad["an image of another shape"] = {**good, image: good[image][:-1]}

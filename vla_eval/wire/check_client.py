@@ -17,6 +17,7 @@ from websockets.sync.client import connect
 from .codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb  # relative: the file is in two packages
 from .keys import key_headers, key_problem
 from .noise import ROWS, look_at, n_inferences, noise_image, noise_state
+from .numbers import GET_MEMORY, MEMORY, SET_MEMORY
 
 HORIZON_STEPS = 60
 PROMPTS, TASK = ("pick up the red cube", "touch the cube that was shown"), "RememberColor3-v0"
@@ -217,6 +218,26 @@ class Episode:
         expect(bool(np.isfinite(np.asarray(chunk)).all()), "Actions are finite.", "values that are not")
         self.chunks.append(np.asarray(chunk))
         self._next += 1
+
+    def continue_from(self, other: Episode) -> None:
+        """Be the other session's episode: its memory in place of this one's, and its chunks so far."""
+        memory = other.remember(None).get(MEMORY)
+        self._server.expect(
+            isinstance(memory, dict), f"The reply to `{GET_MEMORY}` has a map.", shown(memory)
+        )
+        self.remember(memory)
+        self._next, self.chunks = other._next, list(other.chunks)
+
+    def remember(self, memory: Any) -> Message:
+        """Replace the session's memory, or read it if that is None; return the reply."""
+        endpoint = GET_MEMORY if memory is None else SET_MEMORY
+        given = {} if memory is None else {MEMORY: memory}
+        self._connection.send({**given, "endpoint": endpoint, "session_id": self._session_id})
+        reply = self._reply()
+        has_status = isinstance(reply.get("status"), str) and reply["status"] == endpoint
+        requirement = f"The reply to `{endpoint}` has 'status': '{endpoint}'."
+        self._server.expect(has_status, requirement, shown(reply))
+        return reply
 
     def _reply(self) -> Message:
         try:

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple, Protocol  # Any: a message may hold anything
 from vla_eval.core import EpisodeStart, MemoryArrays
 from vla_eval.strict.json_text import shown
 from vla_eval.wire.connection import Connection
-from vla_eval.wire.metadata import GET_MEMORY, MEMORY, SET_MEMORY, ServerMetadata
+from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.wire.numbers import GET_MEMORY, MEMORY, SET_MEMORY
 
 READING_KEY = "sentence_read"
 """Of an answer of this wire: what the policy has read of the sentence, where that is new."""

@@ -14,12 +14,6 @@ from vla_eval.strict.json_text import shown
 
 PROTOCOL = "openpi+1"
 SUPPORTS = ("reset", "observe", "seed", "row")
-MEMORY = "memory"
-"""Of `supports`: the policy's memory can be read and replaced. Also the key of a memory in a message."""
-GET_MEMORY, SET_MEMORY = "memory/get", "memory/set"
-"""Endpoints of a server that supports `MEMORY`."""
-MAX_MEMORY_BYTES = 32 * 2**20  # of all arrays of a memory in a message
-MAX_MEMORY_ARRAYS = 1024
 COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY = "committed/actions", "committed/n_frozen"
 """Of an `infer`: what is left of the chunk under way, (N, A) float32, and how many of its rows are frozen,
 see `CommittedActions`. No published server has such keys: openpi's and LeRobot's take none over a socket."""
@@ -135,20 +129,6 @@ class ServerMetadata:
                 f"same version of mikasa-vla-eval at both ends."
             )
         return metadata
-
-
-def memory_problem(memory: object) -> str | None:
-    """Return what is wrong with a memory that arrived in a message, or is to be sent; None: nothing."""
-    if not isinstance(memory, Mapping) or len(memory) > MAX_MEMORY_ARRAYS:
-        return f"expected a map of at most {MAX_MEMORY_ARRAYS} arrays, found {shown(memory)}"
-    for name, array in memory.items():
-        is_numbers = isinstance(array, np.ndarray) and array.dtype.kind in "biuf" and array.dtype.isnative
-        if not isinstance(name, str) or not is_numbers:
-            return f"expected arrays of numbers by name, found {shown(name)}: {shown(array)}"
-    n_bytes = sum(array.nbytes for array in memory.values())
-    if n_bytes > MAX_MEMORY_BYTES:
-        return f"expected at most {MAX_MEMORY_BYTES} bytes, found {n_bytes}"
-    return None
 
 
 def _on_wire(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Which vectors of numbers are a state: of what type, finite, and with rotations that are rotations.
+"""Which arrays are a state (finite, with rotations that are rotations), and which are a memory.
 
 This file runs with Python 3.8 and numpy 1.22, and imports nothing else: `mikasa_vla_client` ships it, too.
 Both ends of a connection check with it what they send and what they are sent.
@@ -6,7 +6,7 @@ Both ends of a connection check with it what they send and what they are sent.
 
 from __future__ import annotations
 
-from typing import Any, Iterator, Sequence  # Any: a message may hold anything
+from typing import Any, Iterator, Mapping, Sequence  # Any: a message may hold anything
 
 import numpy as np
 
@@ -15,6 +15,13 @@ FLOAT_TYPES = ("float32", "float64")
 UNIT_VECTORS = (("qw", "qx", "qy", "qz"), ("r11", "r21", "r31"), ("r12", "r22", "r32"))
 """Names of numbers that together have length 1: a quaternion, and two columns of a rotation matrix."""
 MAX_LENGTH_ERROR = 0.01  # of a length of 1: float32 rounds to 1e-7, and no rounding to two decimals is more
+
+MEMORY = "memory"
+"""Of `supports`: the policy's memory can be read and replaced. Also the key of a memory in a message."""
+GET_MEMORY, SET_MEMORY = "memory/get", "memory/set"
+"""Endpoints of a server that supports `MEMORY`."""
+MAX_MEMORY_BYTES = 32 * 2**20  # of all arrays of a memory in a message
+MAX_MEMORY_ARRAYS = 1024
 
 
 class NumbersError(ValueError):
@@ -51,3 +58,19 @@ def unit_vectors(names: Sequence[str]) -> Iterator[tuple[tuple[str, ...], list[i
     for group in UNIT_VECTORS:
         if all(name in places for name in group):
             yield group, [places[name] for name in group]
+
+
+def memory_problem(memory: Any) -> str | None:
+    """Return what is wrong with a memory that arrived in a message, or is to be sent; None: nothing."""
+    if not isinstance(memory, Mapping) or len(memory) > MAX_MEMORY_ARRAYS:
+        found = type(memory).__name__ if not isinstance(memory, Mapping) else f"{len(memory)} entries"
+        return f"expected a map of at most {MAX_MEMORY_ARRAYS} arrays, found {found}"
+    for name, array in memory.items():
+        is_numbers = isinstance(array, np.ndarray) and array.dtype.kind in "biuf" and array.dtype.isnative
+        if not isinstance(name, str) or not is_numbers:
+            found = str(array.dtype) if isinstance(array, np.ndarray) else type(array).__name__
+            return f"expected arrays of numbers by name, found {name!r:.80}: {found}"
+    n_bytes = sum(array.nbytes for array in memory.values())
+    if n_bytes > MAX_MEMORY_BYTES:
+        return f"expected at most {MAX_MEMORY_BYTES} bytes, found {n_bytes}"
+    return None

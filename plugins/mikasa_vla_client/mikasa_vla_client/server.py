@@ -22,6 +22,7 @@ from websockets.sync.server import serve as listen
 
 from mikasa_vla_client.codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb
 from mikasa_vla_client.keys import HEADER, explanation, key_problem, refused
+from mikasa_vla_client.numbers import GET_MEMORY, MEMORY, SET_MEMORY
 from mikasa_vla_client.spec import PROMPT_KEY, PolicySpec, SpecError
 
 logger = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ _of_websockets = logging.getLogger(f"{__name__}.websockets")
 _of_websockets.setLevel(logging.CRITICAL)
 
 MAX_SESSIONS = 1024  # of one connection
-ENDPOINTS = ("infer", "reset", "observe")
+ENDPOINTS = ("infer", "reset", "observe", GET_MEMORY, SET_MEMORY)
 EPISODE_FACTS = {"seed": int, "task": str, "run": int, "horizon_steps": int}
 NO_OBSERVATION = {"endpoint", "session_id", "episode_id", "step", "row", *EPISODE_FACTS}
 CLOSE_GOING_AWAY, CLOSE_ERROR = 1001, 1011
@@ -91,12 +92,14 @@ class PolicyServer:
         """See `serve`."""
         is_function = callable(policy) and not hasattr(policy, "infer")
         self._policy: Any = _Function(policy) if is_function else policy
-        for name in ("reset", "infer") + (("observe",) if spec.needs_every_frame else ()):
+        needed = ["reset", "infer", *(["observe"] if spec.needs_every_frame else [])]
+        for name in needed + (["get_memory", "set_memory"] if spec.has_memory else []):
             if not callable(getattr(self._policy, name, None)):
                 raise SpecError(
                     f"policy '{spec.name}' has no method {name}: expected a function, or an object with "
-                    f"reset(session, episode), infer(session, observation) and, if needs_every_frame is "
-                    f"True, observe(session, observation)."
+                    f"reset(session, episode), infer(session, observation), if needs_every_frame is True "
+                    f"observe(session, observation), and if has_memory is True get_memory(session) and "
+                    f"set_memory(session, memory)."
                 )
         problem = None if api_key is None else key_problem(api_key)
         if problem is not None:
@@ -176,11 +179,13 @@ class PolicyServer:
         with self._one_at_a_time:
             reply: dict[str, Any] = {"server_timing": {"queue_ms": _ms_since(asked)}}
             began = time.perf_counter()
-            if endpoint == "reset" or session_id not in sessions:
+            if endpoint in (GET_MEMORY, SET_MEMORY):
+                reply.update(self._memory(endpoint, sessions.get(session_id), request))
+            elif endpoint == "reset" or session_id not in sessions:
                 self._begin(session_id, request, sessions)
             if endpoint == "reset":
                 reply["status"] = "reset"
-            else:
+            elif endpoint in ("infer", "observe"):
                 answer = self._ask(endpoint, sessions[session_id], request)
                 if endpoint == "observe":
                     return None
@@ -204,6 +209,20 @@ class PolicyServer:
                 raise RequestError(f"{key}: expected {EPISODE_FACTS[key].__name__}, found {value!r:.80}.")
         session = sessions[session_id] = Session(session_id, Episode(prompt=prompt, **facts))
         self._policy.reset(session, session.episode)
+
+    def _memory(self, endpoint: str, session: Session | None, request: Mapping[str, Any]) -> dict[str, Any]:
+        """Read or replace the memory of a session; return what the reply says."""
+        if not self._spec.has_memory:
+            raise RequestError(f"'{endpoint}': policy '{self._spec.name}' has no memory that can be read.")
+        if session is None:
+            raise RequestError(f"'{endpoint}' without an episode. Send 'reset' first.")
+        if endpoint == GET_MEMORY:
+            return {"status": endpoint, MEMORY: self._spec.check_memory(self._policy.get_memory(session))}
+        try:
+            self._policy.set_memory(session, self._spec.check_memory(request.get(MEMORY)))
+        except ValueError as exc:
+            raise RequestError(str(exc)) from exc
+        return {"status": endpoint}
 
     def _ask(self, endpoint: str, session: Session, request: Mapping[str, Any]) -> Any:
         """Give the policy a frame; return its actions if they were asked for."""
@@ -251,7 +270,9 @@ def serve(
             (chunk_size, number of action_dims) numbers; with `needs_every_frame` also
             `observe(session, observation)`, called for each frame between two inferences. What the policy
             remembers of an episode, it keeps in `session.memory`. Or a function: observation -> actions.
-            It is never called in two threads at once.
+            It is never called in two threads at once. With `has_memory`, also `get_memory(session)`, a
+            dict of arrays that is all that is kept of the episode, and `set_memory(session, memory)`; a
+            ValueError refuses a memory.
         spec: what it reads and returns. Observations and actions are checked against it.
         host: the address to listen on; other machines reach only another one than the default.
         port: 0 for any free one.

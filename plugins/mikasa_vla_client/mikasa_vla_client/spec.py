@@ -13,7 +13,7 @@ from typing import Any, Mapping
 
 import numpy as np
 
-from mikasa_vla_client.numbers import NumbersError, as_state
+from mikasa_vla_client.numbers import MEMORY, NumbersError, as_state, memory_problem
 
 __version__ = "0.1.0"
 PROTOCOL = "openpi+1"
@@ -58,6 +58,8 @@ class PolicySpec:
             has a method `observe(session, observation)`.
         weights_file: the file of its weights, whose sha256 becomes part of a run's description; None for a
             policy without weights.
+        has_memory: whether its memory of an episode can be read and replaced; then it has the methods
+            `get_memory(session)`, which returns a dict of arrays, and `set_memory(session, memory)`.
     """
 
     name: str
@@ -71,6 +73,7 @@ class PolicySpec:
     control_hz: float = 20.0
     needs_every_frame: bool = False
     weights_file: str | None = None
+    has_memory: bool = False
 
     def __post_init__(self) -> None:
         """Check every value.
@@ -101,7 +104,8 @@ class PolicySpec:
         self._expect(is_mode, "control_mode", "a text that is not empty")
         is_rate = isinstance(self.control_hz, (int, float)) and 0 < self.control_hz < float("inf")
         self._expect(is_rate, "control_hz", "a number above 0")
-        self._expect(isinstance(self.needs_every_frame, bool), "needs_every_frame", "True or False")
+        for field in ("needs_every_frame", "has_memory"):
+            self._expect(isinstance(getattr(self, field), bool), field, "True or False")
         is_there = self.weights_file is None or Path(self.weights_file).is_file()
         self._expect(is_there, "weights_file", "a file that exists, or None")
 
@@ -134,7 +138,7 @@ class PolicySpec:
             "needs_every_frame": self.needs_every_frame,
             "needs_session_id": False,
             "batch_max": 1,
-            "supports": ["reset", "observe", "seed"],
+            "supports": ["reset", "observe", "seed", *([MEMORY] if self.has_memory else [])],
             "versions": {
                 "mikasa_vla_client": __version__,
                 "numpy": np.__version__,
@@ -160,6 +164,17 @@ class PolicySpec:
                 as_state(_required(observation, STATE_KEY), STATE_LAYOUTS[self.state])
             except NumbersError as exc:
                 raise ValueError(f"'{STATE_KEY}': {exc}.") from exc
+
+    def check_memory(self, memory: Any) -> dict[str, Any]:
+        """Return a memory that the policy has handed out, or that it is to get.
+
+        Raises:
+            ValueError: it is no map of arrays of numbers, or too large for a message.
+        """
+        problem = memory_problem(memory)
+        if problem is not None:
+            raise ValueError(f"the memory of policy '{self.name}': {problem}.")
+        return dict(memory)
 
     def check_actions(self, actions: Any) -> np.ndarray[Any, Any]:
         """Return a policy's answer as a float32 array of its own.

@@ -23,10 +23,9 @@ from vla_eval.wire.client import PolicyClient
 from vla_eval.wire.metadata import (
     COMMITTED_ACTIONS_KEY,
     COMMITTED_FROZEN_KEY,
-    MEMORY,
     ServerMetadata,
-    memory_problem,
 )
+from vla_eval.wire.numbers import MEMORY, memory_problem
 
 SESSION_BYTES = 8
 
