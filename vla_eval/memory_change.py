@@ -224,7 +224,7 @@ class ChangedMemory:
 
 @dataclass(slots=True, kw_only=True)
 class _Episode:
-    """What is known of one episode whose memory is changed."""
+    """One episode whose memory is changed."""
 
     start: EpisodeStart
     begun: MemoryArrays  # what it began with
