@@ -63,6 +63,7 @@ def run_probe(
     out: str | Path = OUT,
     probes: str | Sequence[str] | None = None,
     delays: Sequence[int] | None = None,
+    decode: bool = False,
     controls: bool = True,
     in_process: bool = False,
     allow_environment_change: bool = False,
@@ -77,6 +78,8 @@ def run_probe(
         out: the folder of the run folders.
         probes: what is changed: `swap`, `blank`, `delay`, `reset`, … (docs/probe.md); None: these four.
         delays: lengths of the delay, control steps.
+        decode: whether linear probes ask what is in the memory, and when; without `probes`, nothing else is
+            run.
         controls: whether `oracle`, `cue_blind` and `body_memory` are run as well.
         in_process: as for `evaluate`.
         allow_environment_change: as for `evaluate`.
@@ -89,6 +92,7 @@ def run_probe(
     """
     given = {"probes": probes, "delays": delays, **fields}
     chosen = {name: listed(given.pop(name, None)) for name, *_ in INTERVENTIONS.values()}
+    chosen["decode"] = decode
     entries = entries_of(policy)
     start = {"name": "probe", "episodes": EPISODES}
     read = eval_config(config, entries, {"tasks": tasks, **given}, where="run_probe", start=start)

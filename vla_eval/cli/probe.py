@@ -71,6 +71,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="each --n-action-steps (1 2 4 8) with each --delay (0 5 20 80); with --probe cue or delay,cue: "
         "with each --cue (1 2 3 5); with --probe latency: with each --latency, in each --mode",
     )
+    parser.add_argument(
+        "--decode", action="store_true", help="ask by linear probes what is in the memory, and when"
+    )
     parser.add_argument("--no-controls", action="store_true", help="run only the policies that are named")
 
 
@@ -140,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
 
     table = read_probe(worlds, args.out)
     for path in write_retention(table, args.out):
-        print(f"retention curve: {path}", file=sys.stderr)
+        print(f"curve: {path}", file=sys.stderr)
     print_in(args.format, render_probe(table, args.format))
     return EXIT_EPISODE_ERRORS if table.n_errors else 0
 
@@ -187,6 +190,8 @@ def probe_settings(chosen: Mapping[str, Any], *, controls: bool) -> "ProbeSettin
     from vla_eval.probe.worlds import APPEARANCES, MASKS, ProbeSettings
 
     numbers = {name: chosen.get(name) for name in LEAST if name not in OF_GRIDS_ALONE}
+    if chosen.get("decode") and chosen.get("probes") is None:
+        chosen = {**chosen, "probes": ()}  # the world as drawn is enough
     settings: dict[str, Any] = {  # Any: tuples of words or numbers
         name: _numbers(values, name) for name, values in numbers.items()
     }
@@ -200,7 +205,7 @@ def probe_settings(chosen: Mapping[str, Any], *, controls: bool) -> "ProbeSettin
     ):
         settings[name] = _names(chosen.get(name), known, kind=kind, flag=f"--{kind}")
     given = {name: value for name, value in settings.items() if value is not None}
-    return ProbeSettings(**given, controls=controls)
+    return ProbeSettings(**given, decodes=bool(chosen.get("decode")), controls=controls)
 
 
 def _grid_settings(args: argparse.Namespace) -> "GridSettings":

@@ -40,6 +40,8 @@ class CaptureConfig:
     rrd: Which = "none"  # which episodes get a file for the rerun viewer, likewise
     # which episodes get a drawing of commands, the arm's way and borders of chunks, likewise
     strip: Which = "none"
+    # whether each episode gets a file of what the policy remembers after each inference, if it has a memory
+    memory: bool = False
     frame_stride: Steps = 2  # control steps from one frame to the next
 
     def __post_init__(self) -> None:

@@ -10,9 +10,19 @@ import gc
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from vla_eval.config.environment import EnvSettings
-from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, Policy, SimEnv, StepObserver, StepResult
+from vla_eval.core import (
+    ActionChunk,
+    EpisodeStart,
+    FloatArray,
+    Policy,
+    RememberingPolicy,
+    SimEnv,
+    StepObserver,
+    StepResult,
+)
 from vla_eval.envs.factory import describe_device, make_env
 from vla_eval.episode_log import check_execution
 from vla_eval.errors import (
@@ -26,6 +36,7 @@ from vla_eval.errors import (
 from vla_eval.evaluation.donors import donor_memories, donor_settings
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
+from vla_eval.evaluation.memory_log import MemoryLog
 from vla_eval.memory_change import ChangedMemory, memory_parts
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.policies.compiled import CompiledPolicy
@@ -101,9 +112,11 @@ class EpisodeRunner:
         tell: Callable[[Notice], None],
         capture: EpisodeCapture | None = None,
         asks_memory: bool = False,
+        memories_in: Path | None = None,
     ) -> None:
         self._capture = capture
         self._asks_memory = asks_memory  # of the policy; False once the parent knows
+        self._memories_in = memories_in  # the run folder, if what a policy remembers is kept
         self._heartbeat = heartbeat
         self._tell = tell
         self._env: SimEnv | None = None
@@ -164,12 +177,18 @@ class EpisodeRunner:
         tapes = self._capture.tapes(starts, with_images=self._is_live(group)) if self._capture else None
         count = _StepCount(self._heartbeat, functools.partial(self._tell_sentences, group, policy))
         observers: list[StepObserver] = [count, *([tapes] if tapes else [])]
+        memories = None
+        if self._memories_in is not None and isinstance(policy, RememberingPolicy) and policy.spec.has_memory:
+            memories = MemoryLog(policy)
+            observers.append(memories)
         records = rollout(env, changed, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         if self._asks_memory:
             self._asks_memory = False
             self._tell(MemoryFound(policy=group.key.policy, parts=memory_parts(policy, starts[0])))
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
+        if memories is not None and self._memories_in is not None:
+            memories.write(starts, named, self._memories_in)
         timings = self._heartbeat.timings([job.key for job in batch.jobs])
         if self._capture and tapes:
             self._capture.write(

@@ -42,6 +42,8 @@ class ProbeSection:
     notes: tuple[str, ...]
     plots: Plots | None = None
     curves_table: PrintedTable | None = None
+    memory_plots: Plots | None = None  # what is in the memory, over the control steps
+    memory_table: PrintedTable | None = None
     heat: tuple[tuple[str, tuple[Chart, ...]], ...] = ()
     # pairs by first choice in the world as drawn (rows) and in the other one (columns); a cell is right
     # if some of its pairs follow both cues

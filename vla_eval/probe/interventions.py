@@ -220,7 +220,8 @@ def plan_probe(
         known = None if memories is None else memories.get(spec.id, {})
         of_task = TaskWorlds(spec=spec, config=config, settings=settings, memories=known)
         changed: list[World] = []
-        is_asked = False  # whether the world as drawn is needed to know who remembers
+        # Whether the world as drawn is needed, to know who remembers and what.
+        is_asked = settings.decodes and of_task.has_phases
         for probe in settings.probes:
             rule = INTERVENTIONS[probe]
             is_possible = of_task.has_phases or not rule.needs_phases

@@ -4,6 +4,7 @@ import json
 from collections.abc import Sequence
 
 from vla_eval.probe.choice_pairs import ChoicePairs
+from vla_eval.probe.decoding_text import decoding_json, printed_decoding
 from vla_eval.probe.find_worlds import find_probes
 from vla_eval.probe.grid_text import render_grid
 from vla_eval.probe.mistakes import MISTAKES, Mistakes
@@ -38,7 +39,8 @@ def render_probe(table: ProbeTable, fmt: Format) -> str:
         return json.dumps(probe_json(table), indent=2, ensure_ascii=False, allow_nan=False)
     if fmt == "csv":
         return rows_as_csv([json_row(row) for row in table.rows])
-    return write_tables([printed_probe(table)], fmt)
+    decoded = [printed_decoding(table.decoded)] if table.decoded else []
+    return write_tables([printed_probe(table), *decoded], fmt)
 
 
 def printed_probe(table: ProbeTable) -> PrintedTable:
@@ -52,6 +54,7 @@ def probe_json(table: ProbeTable) -> JsonRow:
     return {
         "probe_version": PROBE_VERSION,
         "rows": [json_row(row) for row in table.rows],
+        "decoded": decoding_json(table.decoded),
         "retention": [_json_retention(curve) for curve in table.retention],
         "sentences": sentences(table),
         "notes": notes(table),

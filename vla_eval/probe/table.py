@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from vla_eval.probe.decoding import Decoded, decoded_memories
 from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
@@ -83,6 +84,7 @@ class ProbeTable:
 
     rows: tuple[ProbeRow, ...]
     retention: tuple[Retention, ...]
+    decoded: tuple[Decoded, ...] = ()  # what linear probes find in memories that were kept
 
     @property
     def n_errors(self) -> int:
@@ -104,9 +106,10 @@ def table_of_runs(worlds: Sequence[World], runs: Sequence[StoredRun]) -> ProbeTa
         for policy, parts in run.description.memories.items()
         if world.task in changed and not parts
     }
-    return probe_table(
+    table = probe_table(
         worlds, [run.records for run in runs], order=policy_order(runs), without_memory=without_memory
     )
+    return replace(table, decoded=tuple(decoded_memories(worlds, runs)))
 
 
 def policy_order(runs: Sequence[StoredRun]) -> tuple[str, ...]:

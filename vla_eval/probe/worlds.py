@@ -64,6 +64,7 @@ class ProbeSettings:
     hold_steps: tuple[int, ...] = ()  # from which control steps on a memory is held; none: as `reset_steps`
     ages: tuple[int, ...] = (5, 10, 20)  # of a stale memory, control steps
     erased: tuple[str, ...] = ()  # parts of a memory; none: each of its parts
+    decodes: bool = False  # whether linear probes ask what is in the memory, in the world as drawn
     controls: bool = True
 
 
@@ -192,8 +193,10 @@ class TaskWorlds:
             policies += [control for control in self._controls() if control not in policies]
         # Written out, so that this world is one level of the delay whatever the simulator's default is.
         delay = {"delay_steps": default_delay_steps(self.spec)} if self.has_phases else {}
+        decodes = self.settings.decodes and intervention == AS_DRAWN
         config = replace(
             self.config,
+            capture=replace(self.config.capture, memory=True) if decodes else self.config.capture,
             # A part of a memory has a name with a slash.
             name="_".join(
                 [self.spec.id, intervention, *([] if level is None else [str(level).replace("/", ".")])]

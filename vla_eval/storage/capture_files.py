@@ -1,9 +1,9 @@
-"""What the files of an episode that was captured are called: video, rerun file, strip."""
+"""What the files of an episode that was captured are called: video, rerun file, strip, memory."""
 
 from pathlib import Path
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.folders import RRDS, STRIPS, VIDEOS
+from vla_eval.storage.folders import MEMORIES, RRDS, STRIPS, VIDEOS
 
 
 def capture_stem(record: EpisodeRecord) -> str:
@@ -37,3 +37,8 @@ def rrd_file(folder: Path, record: EpisodeRecord) -> Path:
 def strip_file(folder: Path, record: EpisodeRecord) -> Path:
     """Return where the drawing of how an episode was executed is, or would be."""
     return folder / STRIPS / f"{capture_stem(record)}.svg"
+
+
+def memory_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the file of what a policy remembered in an episode is, or would be."""
+    return folder / MEMORIES / f"{capture_stem(record)}.npz"

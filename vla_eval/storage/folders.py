@@ -11,8 +11,8 @@ from vla_eval.storage.run_file import RUN_FILE
 EPISODES_FILE = "episodes.jsonl"
 TIMINGS_FILE = "timings.jsonl"
 LOCK_FILE = "run.lock"
-LOGS, VIDEOS, RRDS, STRIPS = "logs", "videos", "rrd", "strips"
-SUBFOLDERS = (LOGS, VIDEOS, RRDS, STRIPS)
+LOGS, VIDEOS, RRDS, STRIPS, MEMORIES = "logs", "videos", "rrd", "strips", "memories"
+SUBFOLDERS = (LOGS, VIDEOS, RRDS, STRIPS, MEMORIES)
 # What a process that was killed before it wrote run.json may have left behind.
 UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 

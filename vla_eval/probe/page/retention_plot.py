@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vla_eval.page.charts import Curves, Point, Series, curves_png
+from vla_eval.probe.decoding_text import decoding_curves
 from vla_eval.probe.page.png_files import write_beside
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeTable
@@ -13,11 +14,16 @@ CURVES: dict[str, str] = {"follows": "follows the cue", "warranted_choice": "fol
 
 
 def write_retention(table: ProbeTable, folder: Path) -> list[Path]:
-    """Write a PNG file per task and kind of curve, next to the folder of runs, and return their paths."""
+    """Write a PNG file per task and kind of curve, next to the folder of runs, and return their paths.
+
+    Beside retention, what linear probes decode.
+    """
     drawn = {
         f"{own[0].task}_{own[0].of}": curves_png(retention_lines(own, line_colors(own)))
         for own in by_kind(table.retention)
     }
+    for (task, label), one in decoding_curves(table.decoded).items():
+        drawn[f"{task}_{label.replace(' ', '_')}_decoded"] = curves_png(one)
     return write_beside(folder, drawn)
 
 

@@ -12,6 +12,7 @@ from vla_eval.page.probe_section import FilmFrame, FilmPair, Filmstrip, ProbeSec
 from vla_eval.page.rates import Plots, Sign
 from vla_eval.page.tables import Matrix, page_table, shaded
 from vla_eval.probe.choice_pairs import ChoicePairs
+from vla_eval.probe.decoding_text import decoding_curves, printed_decoding
 from vla_eval.probe.find_worlds import Found, FoundProbe, find_probes
 from vla_eval.probe.grid_text import grid_notes, grid_sentences, printed_grid
 from vla_eval.probe.page.heat_maps import heat_maps
@@ -48,6 +49,8 @@ def _probe_section(probe: FoundProbe) -> ProbeSection:
         notes=(*notes(table), *probe.doubles),
         plots=retention_plots(table) if table.retention else None,
         curves_table=_half_lives(table) if table.retention else None,
+        memory_plots=_memory_plots(table) if table.decoded else None,
+        memory_table=printed_decoding(table.decoded) if table.decoded else None,
         matrices=tuple(map(_matrix, pairs)),
         films=film_pairs(probe.worlds, pairs),
     )
@@ -76,6 +79,17 @@ def retention_plots(table: ProbeTable) -> Plots:
     )
     charts = (curves(retention_lines(own, colors)) for own in by_kind(table.retention))
     return Plots(legend=legend, charts=tuple(charts))
+
+
+def _memory_plots(table: ProbeTable) -> Plots:
+    """Draw what linear probes decode, a chart per task and label."""
+    drawn = decoding_curves(table.decoded)
+    names = dict.fromkeys(one.name for curve in drawn.values() for one in curve.series if one.kind == "solid")
+    legend = (
+        *(Sign(name, sign(number, is_line=False)) for number, name in enumerate(names)),
+        Sign("chance", reference_sign("chance")),
+    )
+    return Plots(legend=legend, charts=tuple(map(curves, drawn.values())))
 
 
 def _half_lives(table: ProbeTable) -> PrintedTable:

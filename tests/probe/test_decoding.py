@@ -1,0 +1,139 @@
+"""What linear probes find in a memory: on made-up features, and on a policy of which it is known."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.probe.test_changed_memory import TASK, probe, remembers, row
+from vla_eval.cli.main import main
+from vla_eval.errors import RunFolderError
+from vla_eval.evaluation.memory_log import EpisodeMemory, _small
+from vla_eval.probe.decoding import predicted
+
+__all__ = ["remembers"]
+pytestmark = pytest.mark.usefixtures("in_this_process")
+
+N = 15
+FOLDS = np.arange(60) % 5
+
+
+class TestProbe:
+    def test_a_class_that_is_one_of_many_features_is_found_on_other_seeds(self) -> None:
+        rng = np.random.default_rng(0)
+        labels = rng.integers(0, 3, 60)
+        features = rng.normal(size=(60, 40))
+        features[np.arange(60), labels] += 6.0
+        assert (predicted(features, labels, FOLDS) == labels).mean() >= 0.95
+
+    def test_noise_of_many_features_is_at_chance_although_it_fits_what_it_was_fitted_on(self) -> None:
+        rng = np.random.default_rng(1)
+        labels = rng.integers(0, 3, 60)
+        right = (predicted(rng.normal(size=(60, 500)), labels, FOLDS) == labels).sum()
+        # 20 of 60 are expected; above 32 with a probability of less than 0.001.
+        assert right <= 32
+
+    def test_an_episode_is_never_predicted_by_its_own_answer(self) -> None:
+        features = np.eye(60)  # a feature for each episode, which no other has
+        labels = np.arange(60) % 2
+        assert (predicted(features, labels, FOLDS) == labels).mean() <= 0.5
+
+    def test_what_is_not_finite_or_constant_counts_for_nothing(self) -> None:
+        labels = np.arange(60) % 3
+        features = np.zeros((60, 6))
+        features[np.arange(60), labels] = 1.0
+        features[:, 3], features[:, 4], features[::7, 5] = np.inf, 1e30, np.nan
+        assert (predicted(features, labels, FOLDS) == labels).all()
+
+    def test_units_do_not_matter(self) -> None:
+        rng = np.random.default_rng(2)
+        labels = rng.integers(0, 3, 60)
+        features = rng.normal(size=(60, 8))
+        features[np.arange(60), labels] += 2.0
+        scaled = features * np.array([1e-6, 1e6, 1, 3, 1e3, 1, 1e-3, 1]) + 5
+        assert (predicted(features, labels, FOLDS) == predicted(scaled, labels, FOLDS)).all()
+
+
+def test_the_means_of_a_frame_are_over_equal_blocks() -> None:
+    image = np.zeros((32, 48, 3), np.uint8)
+    image[:2, :3] = 200
+    image[2, 0] = 90
+    small = _small(image)
+    assert small.shape == (16, 16, 3)
+    assert (small[0, 0] == 200).all()
+    assert (small[1, 0] == 15).all()  # one of 2 x 3 pixels
+    assert small.sum() == 3 * 215
+
+
+@pytest.mark.parametrize(
+    ("arrays", "says"),
+    [
+        ({"memory/a": np.zeros((2, 3))}, "expected 'steps' with whole numbers"),
+        ({"steps": np.zeros(2), "memory/a": np.zeros((2, 3))}, "expected 'steps' with whole numbers"),
+        ({"steps": np.arange(2), "memory/a": np.zeros((3, 3))}, "expected an array with 2 rows"),
+        ({"steps": np.arange(2), "other": np.zeros((2, 3))}, "expected an array with 2 rows"),
+        ({"steps": np.arange(2), "memory/a": np.array(["a", "b"])}, "expected numbers, found <U1"),
+        ({"steps": np.arange(2), "memory/a": np.array([None, {}])}, "Object arrays cannot be loaded"),
+    ],
+)
+def test_a_file_that_is_another_one_is_refused_and_no_pickle_is_loaded(
+    arrays: dict[str, Any], says: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "a.npz"
+    np.savez(path, **arrays)
+    with pytest.raises(RunFolderError, match=says):
+        EpisodeMemory.read(path)
+
+
+@pytest.mark.parametrize("data", [b"", b"PK", b"\x80\x04K\x01.", b"no archive at all"])
+def test_bytes_that_are_no_archive_are_refused(data: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    path.write_bytes(data)
+    with pytest.raises(RunFolderError, match="expected arrays in npz"):
+        EpisodeMemory.read(path)
+
+
+def test_what_a_policy_keeps_is_decoded_from_the_step_on_that_it_is_shown(
+    remembers: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = ("--policy", str(remembers / "remembers.yaml"), "--no-controls", "--decode")
+    found = probe(remembers, capsys, *policy, "--probe", "reset", "--reset-at", "5", "--episodes", str(N))
+    own = {one["label"]: one for one in found["decoded"]}
+    assert set(own) == {"item", "place", "time"}
+    item = own["item"]
+    assert item["response_step"] == 10
+    assert [point["step"] for point in item["points"]] == list(range(0, 45, 5))
+    # After the inference at step 0 the shown one is stored, and stays.
+    assert {(point["n_episodes"], point["decoded"]) for point in item["points"]} == {(N, 1.0)}
+    assert {point["decoded_from_frame"] for point in item["points"]} == {None}  # it reads no camera
+    assert item["acts"] == {"both": N, "knows": 0, "acts": 0, "neither": 0}
+    # Its place is drawn apart from its colour: the memory does not hold it.
+    assert own["place"]["points"][2]["decoded"] < 0.8
+    assert own["time"]["points"][0]["decoded"] == 1.0  # it counts its inferences
+    assert row(found, "none")["n_follows"] == N
+    assert len(list((remembers / "out" / f"{TASK}_none" / "memories").glob("*.npz"))) == N
+    assert (remembers / f"out_{TASK}_item_decoded.png").is_file()
+
+    runs = [str(path) for path in sorted((remembers / "out").iterdir())]
+    sentence = f"at the response its memory holds the item in {N} of {N} episodes, and it acts on it in {N}"
+    assert main(["report", *runs]) == 0
+    assert sentence in capsys.readouterr().out
+    assert main(["report", *runs, "--html", str(remembers / "page")]) == 0
+    page = (remembers / "page" / "index.html").read_text()
+    assert "In the memory" in page and sentence in page
+
+
+def test_without_it_no_memory_is_kept(remembers: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = ("--policy", str(remembers / "remembers.yaml"), "--no-controls", "--probe", "blank")
+    assert probe(remembers, capsys, *policy)["decoded"] == []
+    assert not (remembers / "out" / f"{TASK}_none" / "memories").exists()
+
+
+def test_too_few_episodes_say_nothing(remembers: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy = ("--policy", str(remembers / "remembers.yaml"), "--no-controls", "--decode")
+    found = probe(remembers, capsys, *policy)
+    assert found["decoded"] == []
+    assert [one["intervention"] for one in found["rows"]] == ["none"]  # without --probe, nothing else is run
+    assert json.loads((remembers / "out" / f"{TASK}_none" / "run.json").read_text())["memories"]

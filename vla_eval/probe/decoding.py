@@ -1,0 +1,256 @@
+"""What is in a policy's memory, by linear probes: which item, which place, in which order, how long to wait.
+
+A probe is a ridge regression from the memory after the inference of one control step to what was right in
+the episode. Each episode is predicted by a probe that was fitted on others (five folds, by seed), and set
+beside the same probe on the newest frame alone. `docs/probe.md` defines each quantity.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vla_eval.evaluation.memory_log import EpisodeMemory
+from vla_eval.probe.phases import Phases, phases_of
+from vla_eval.probe.quantities import Share, follows
+from vla_eval.probe.world_records import by_policy, results_of
+from vla_eval.probe.worlds import AS_DRAWN, World
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.capture_files import memory_file
+from vla_eval.storage.run_folder import StoredRun
+from vla_eval.tasks.catalog import task_spec
+
+N_FOLDS = 5
+LEAST_EPISODES = 10  # at a step; with fewer nothing is fitted
+TIME = "time"  # the label that is the control step itself
+RIDGE = 0.1  # of the mean squared length of an episode's features, which is 1
+Vectors = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Label:
+    """What a probe is asked for."""
+
+    name: str  # `item`, `place`, `item 2` …
+    of: Callable[[EpisodeRecord], int | None]  # None where an episode has no answer
+
+
+class DecodedStep(NamedTuple):
+    """How often a probe is right at one control step."""
+
+    step: int
+    memory: Share
+    frame: Share | None  # of the probe on the newest frame; None for a policy that reads no camera
+
+
+class Acts(NamedTuple):
+    """Episodes by what the memory holds at the response, and whether the policy follows the cue."""
+
+    both: int  # the probe is right, and the policy
+    knows: int  # the probe alone
+    acts: int  # the policy alone
+    neither: int
+
+    @property
+    def n(self) -> int:
+        """All of them."""
+        return sum(self)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Decoded:
+    """What one policy's memory says of one label."""
+
+    task: str
+    policy: str
+    n_action_steps: int
+    label: str
+    chance: float  # of the most frequent answer
+    response_step: int
+    steps: tuple[DecodedStep, ...]
+    acts: Acts | None  # of what a policy can choose; None without an inference at the response
+
+
+def decoded_memories(worlds: Sequence[World], runs: Sequence[StoredRun]) -> list[Decoded]:
+    """Return what can be decoded in the worlds as drawn, of all policies whose memory was kept there."""
+    found: list[Decoded] = []
+    for world, run in zip(worlds, runs, strict=True):
+        spec = task_spec(world.task)
+        phases = phases_of(spec, world.config.env)
+        if world.intervention != AS_DRAWN or not isinstance(phases, Phases):
+            continue
+        for (policy, k), records in by_policy(run.records).items():
+            episodes = _episodes(results_of(records), run.path)
+            time = _time(episodes, phases, task=world.task, policy=policy, k=k)
+            found += [time] if time is not None else []
+            for label in _labels([record for record, _ in episodes]):
+                one = _decoded(episodes, label, phases, task=world.task, policy=policy, k=k)
+                found += [one] if one is not None else []
+    return found
+
+
+_Episodes = Sequence[tuple[EpisodeRecord, EpisodeMemory]]
+
+
+def _episodes(records: Sequence[EpisodeRecord], folder: Path) -> list[tuple[EpisodeRecord, EpisodeMemory]]:
+    files = [(record, memory_file(folder, record)) for record in records]
+    return [(record, EpisodeMemory.read(path)) for record, path in files if path.is_file()]
+
+
+def _labels(records: Sequence[EpisodeRecord]) -> list[Label]:
+    """Return what is worth asking: a label with one answer alone says nothing."""
+    n_shown = max((len(record.right_candidates or ()) for record in records), default=0)
+    asked = [
+        Label(name="item", of=lambda record: record.target),
+        Label(name="place", of=lambda record: record.target_place),
+    ]
+    if n_shown > 1:
+        asked += [Label(name=f"item {i + 1}", of=_shown_at(i)) for i in range(n_shown)]
+    return [label for label in asked if len({label.of(record) for record in records} - {None}) > 1]
+
+
+def _shown_at(index: int) -> Callable[[EpisodeRecord], int | None]:
+    def of(record: EpisodeRecord) -> int | None:
+        shown = record.right_candidates or ()
+        return shown[index] if index < len(shown) else None
+
+    return of
+
+
+def _decoded(
+    episodes: _Episodes, label: Label, phases: Phases, *, task: str, policy: str, k: int
+) -> Decoded | None:
+    answered = [(record, memory) for record, memory in episodes if label.of(record) is not None]
+    answers = [label.of(record) for record, _ in answered]
+    steps: list[DecodedStep] = []
+    acts = None
+    for step in sorted({int(one) for _, memory in answered for one in memory.steps}):
+        there = [(record, memory) for record, memory in answered if step in memory.steps]
+        if len(there) < LEAST_EPISODES:
+            continue
+        labels = [answer for record, _ in there if (answer := label.of(record)) is not None]
+        at = [one.steps.tolist().index(step) for _, one in there]
+        seeds = [record.seed for record, _ in there]
+        memories = [(one.memory, row) for (_, one), row in zip(there, at, strict=True)]
+        frames = [(one.frames, row) for (_, one), row in zip(there, at, strict=True)]
+        right, frame = _is_right(memories, labels, seeds), _share(frames, labels, seeds)
+        if right is None:
+            continue
+        steps.append(DecodedStep(step, Share(int(right.sum()), len(right)), frame))
+        if acts is None and step >= phases.response_step and label.name in ("item", "place"):
+            acted = np.array([follows(record) for record, _ in there])
+            acts = Acts(
+                both=int((right & acted).sum()),
+                knows=int((right & ~acted).sum()),
+                acts=int((~right & acted).sum()),
+                neither=int((~right & ~acted).sum()),
+            )
+    if not steps:
+        return None
+    return Decoded(
+        task=task,
+        policy=policy,
+        n_action_steps=k,
+        label=label.name,
+        chance=max(answers.count(one) for one in set(answers)) / len(answers),
+        response_step=phases.response_step,
+        steps=tuple(steps),
+        acts=acts,
+    )
+
+
+def _time(episodes: _Episodes, phases: Phases, *, task: str, policy: str, k: int) -> Decoded | None:
+    """Return how often the step can be told from the memory, at the inferences before the response."""
+    waiting = [
+        (record, memory, row, int(step))
+        for record, memory in episodes
+        for row, step in enumerate(memory.steps)
+        if step < phases.response_step
+    ]
+    steps = [step for *_, step in waiting]
+    if len(episodes) < LEAST_EPISODES or len(set(steps)) < 2:
+        return None
+    seeds = [record.seed for record, *_ in waiting]
+    memory = _share([(one.memory, row) for _, one, row, _ in waiting], steps, seeds)
+    frame = _share([(one.frames, row) for _, one, row, _ in waiting], steps, seeds)
+    if memory is None:
+        return None
+    return Decoded(
+        task=task,
+        policy=policy,
+        n_action_steps=k,
+        label=TIME,
+        chance=max(steps.count(one) for one in set(steps)) / len(steps),
+        response_step=phases.response_step,
+        steps=(DecodedStep(max(steps), memory, frame),),
+        acts=None,
+    )
+
+
+def _share(
+    rows: Sequence[tuple[Mapping[str, NDArray[Any]], int]], labels: Sequence[int], seeds: Sequence[int]
+) -> Share | None:
+    right = _is_right(rows, labels, seeds)
+    return None if right is None else Share(int(right.sum()), len(right))
+
+
+def _features(rows: Sequence[tuple[Mapping[str, NDArray[Any]], int]]) -> Vectors | None:
+    """Return (N, D) of one row of each file's arrays, by name; None without arrays, or of several shapes."""
+    vectors = [
+        np.concatenate([np.zeros(0), *(arrays[name][row].ravel() for name in sorted(arrays))])
+        for arrays, row in rows
+    ]
+    is_one_shape = len({len(vector) for vector in vectors}) == 1 and len(vectors[0]) > 0
+    return np.array(vectors, np.float64) if is_one_shape else None
+
+
+def _is_right(
+    rows: Sequence[tuple[Mapping[str, NDArray[Any]], int]], labels: Sequence[int], seeds: Sequence[int]
+) -> NDArray[np.bool_] | None:
+    """Return for each row whether the probe of the other folds is right; None without features."""
+    features = _features(rows)
+    if features is None:
+        return None
+    asked = np.array(labels)
+    right: NDArray[np.bool_] = predicted(features, asked, np.array(seeds) % N_FOLDS) == asked
+    return right
+
+
+def predicted(features: Vectors, labels: NDArray[np.int64], folds: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return what ridge regression on the other folds predicts for each row: the class of the largest number.
+
+    Args:
+        features: (N, D); numbers that are not finite count as 0 after standardising, as do constants.
+        labels: (N,) classes.
+        folds: (N,) the fold of each row.
+    """
+    found = np.full(len(labels), labels[0])
+    for fold in np.unique(folds):
+        test, train = folds == fold, folds != fold
+        if not train.any():
+            continue
+        finite = np.where(np.isfinite(features), features, np.nan)
+        with np.errstate(invalid="ignore"):
+            mean, spread = _moments(finite[train])
+            scaled = np.nan_to_num((finite - mean) / spread, nan=0.0, posinf=0.0, neginf=0.0)
+        scaled /= np.sqrt(max(float((scaled[train] ** 2).sum(axis=1).mean()), 1e-12))
+        classes = np.unique(labels[train])
+        targets = (labels[train][:, None] == classes[None, :]).astype(np.float64)
+        bias = targets.mean(axis=0)
+        kernel = scaled[train] @ scaled[train].T
+        weights = np.linalg.solve(kernel + RIDGE * np.eye(len(kernel)), targets - bias)
+        scores = bias + scaled[test] @ scaled[train].T @ weights
+        found[test] = classes[scores.argmax(axis=1)]
+    return found
+
+
+def _moments(rows: Vectors) -> tuple[Vectors, Vectors]:
+    """Return mean and standard deviation of each feature over the rows with a number; NaN for constants."""
+    known = ~np.isnan(rows)
+    n = np.maximum(known.sum(axis=0), 1)
+    mean = np.where(known, rows, 0.0).sum(axis=0) / n
+    spread = np.sqrt((np.where(known, rows - mean, 0.0) ** 2).sum(axis=0) / n)
+    return mean, np.where(spread > 1e-9 * np.maximum(np.abs(mean), 1e-30), spread, np.nan)
