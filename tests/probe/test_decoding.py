@@ -17,6 +17,7 @@ __all__ = ["remembers"]
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
 N = 15
+FAKE = ("--workers", "1", "--set", "simulator=fake", "--set", "env.horizon_steps=45", "--n-action-steps", "5")
 FOLDS = np.arange(60) % 5
 
 
@@ -129,6 +130,21 @@ def test_without_it_no_memory_is_kept(remembers: Path, capsys: pytest.CaptureFix
     policy = ("--policy", str(remembers / "remembers.yaml"), "--no-controls", "--probe", "blank")
     assert probe(remembers, capsys, *policy)["decoded"] == []
     assert not (remembers / "out" / f"{TASK}_none" / "memories").exists()
+    main(
+        [
+            "probe",
+            "--task",
+            TASK,
+            *policy,
+            "--episodes",
+            "6",
+            "--out",
+            str(remembers / "out"),
+            *FAKE,
+            "--decode",
+        ]
+    )
+    assert "6 of 6 episodes were run without --decode" in capsys.readouterr().err
 
 
 def test_too_few_episodes_say_nothing(remembers: Path, capsys: pytest.CaptureFixture[str]) -> None:

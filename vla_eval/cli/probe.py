@@ -159,12 +159,15 @@ def all_worlds(
 
     Arguments as for `plan_later`.
     """
+    from vla_eval.probe.decoding import kept_nothing
     from vla_eval.probe.interventions import plan_later
 
     _say_left_out(probe)
     yield from probe.worlds
     later = plan_later(config, settings, probe, out, name_of)
     _say_left_out(later)
+    for line in kept_nothing(probe.worlds, out) if settings.decodes else ():
+        print(line, file=sys.stderr)
     yield from later.worlds
 
 

@@ -20,7 +20,7 @@ from vla_eval.probe.world_records import by_policy, results_of
 from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import memory_file
-from vla_eval.storage.run_folder import StoredRun
+from vla_eval.storage.run_folder import StoredRun, read_run
 from vla_eval.tasks.catalog import task_spec
 
 N_FOLDS = 5
@@ -90,6 +90,25 @@ def decoded_memories(worlds: Sequence[World], runs: Sequence[StoredRun]) -> list
                 one = _decoded(episodes, label, phases, task=world.task, policy=policy, k=k)
                 found += [one] if one is not None else []
     return found
+
+
+def kept_nothing(worlds: Sequence[World], out: Path) -> list[str]:
+    """Return a line for each world as drawn in which memories were not kept."""
+    lines = []
+    for world in worlds:
+        run = read_run(out / world.config.name)
+        memories = run.description.memories
+        missing = [
+            record
+            for record in results_of(run.records)
+            if memories.get(record.policy) and not memory_file(run.path, record).is_file()
+        ]
+        if world.intervention == AS_DRAWN and missing:
+            lines.append(
+                f"{run.path}: {len(missing)} of {len(run.records)} episodes were run without --decode, and "
+                "of their memory nothing was kept: remove the folder to run them again."
+            )
+    return lines
 
 
 _Episodes = Sequence[tuple[EpisodeRecord, EpisodeMemory]]
