@@ -92,11 +92,10 @@ def run_probe(
     """
     given = {"probes": probes, "delays": delays, **fields}
     chosen = {name: listed(given.pop(name, None)) for name, *_ in INTERVENTIONS.values()}
-    chosen["decode"] = decode
     entries = entries_of(policy)
     start = {"name": "probe", "episodes": EPISODES}
     read = eval_config(config, entries, {"tasks": tasks, **given}, where="run_probe", start=start)
-    settings = probe_settings(chosen, controls=controls)
+    settings = probe_settings({**chosen, "decode": decode}, controls=controls)
     probe = plan_probe(read, settings)
     objects = {one.name: one for one in entries if isinstance(one, PolicyEntry)}
 
