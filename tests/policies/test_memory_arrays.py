@@ -36,7 +36,10 @@ COMMON: dict[str, Any] = {
 }
 SMALL = {"width": 16, "heads": 2, "context_steps": 3}
 REMEMBERING = [core for core, row in CORES.items() if row.remembers]
-NAMES = ["memory", *REMEMBERING]
+OFTEN = ("memory", "gru", "gtrxl")  # one of each kind: named parts, a state, cached steps
+NAMES = [
+    name if name in OFTEN else pytest.param(name, marks=pytest.mark.slow) for name in ("memory", *REMEMBERING)
+]
 
 
 def config_of(name: str) -> Any:

@@ -33,7 +33,7 @@ BYTES_PER_NUMBER = 4  # of tiny recipes, all float32
         ("spatialvla_tiny", False),
         pytest.param("octo_tiny", False, marks=pytest.mark.slow),
         ("pi0_expert", True),
-        ("pi05_lora", True),
+        pytest.param("pi05_lora", True, marks=pytest.mark.slow),
         ("pi0_fast", True),
         ("smolvla", True),
         pytest.param("smolvla_frames", True, marks=pytest.mark.slow),
