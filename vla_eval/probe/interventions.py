@@ -39,9 +39,8 @@ class Rule(NamedTuple):
     # Swaps have a sentence of their own.
     clause: str = ""
     needs_phases: bool = True  # whether it makes no sense for tasks without phases
-    of_memory: bool = (
-        False  # whether it changes a policy's memory: who has one is known after the first world
-    )
+    # whether it changes a policy's memory: who has one is known after the first world
+    of_memory: bool = False
 
 
 INTERVENTIONS: Mapping[Intervention, Rule] = {
