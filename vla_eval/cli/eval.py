@@ -164,7 +164,7 @@ def run(args: argparse.Namespace) -> int:
     check_baseline(args.baseline, [policy.name for policy in policies])
 
     def needs() -> tuple[Needed, ...]:
-        captured = (shared_folder(args.out or RUNS_FOLDER),) if config.capture.is_on else ()
+        captured = (shared_folder(args.out or RUNS_FOLDER),) if config.capture.writes_files else ()
         return (*needed_files(policies), *captured)
 
     with backend_of(args, needs=needs) as backend:

@@ -22,7 +22,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.storage.shard import shard_folder
-from vla_eval.workers.needed_files import Needed
+from vla_eval.workers.needed_files import Needed, shared_folder
 
 if TYPE_CHECKING:
     from vla_eval.probe.grid import GridSettings
@@ -301,7 +301,7 @@ def _run_all(
 
     out = shard_folder(args.out, args.shard)
     runs = ((out / config.name, config) for config in (configs if in_turn is None else in_turn))
-    with backend_of(args, needs=lambda: _needed(configs)) as backend:
+    with backend_of(args, needs=lambda: _needed(configs, out)) as backend:
         done = evaluate_each(runs, args, backend=backend)
     if done.stopped is not None:
         return done.stopped
@@ -311,12 +311,13 @@ def _run_all(
     return EXIT_EPISODE_ERRORS if done.n_errors else 0
 
 
-def _needed(configs: Sequence[EvalConfig]) -> tuple[Needed, ...]:
+def _needed(configs: Sequence[EvalConfig], out: Path) -> tuple[Needed, ...]:
     from vla_eval.evaluation.needed_files import needed_files
     from vla_eval.policies.entries import load_policy_entries
 
     policies = dict.fromkeys(policy for config in configs for policy in config.policies)
-    return needed_files(load_policy_entries(tuple(policies)))
+    written = any(config.capture.writes_files for config in configs)
+    return (*needed_files(load_policy_entries(tuple(policies))), *([shared_folder(out)] if written else []))
 
 
 def _config(args: argparse.Namespace) -> EvalConfig:

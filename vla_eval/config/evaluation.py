@@ -60,6 +60,11 @@ class CaptureConfig:
         return self.needs_images or self.strip != "none"
 
     @property
+    def writes_files(self) -> bool:
+        """Whether workers write into the run folder."""
+        return self.is_on or self.memory
+
+    @property
     def needs_images(self) -> bool:
         """Whether what is captured shows images."""
         return self.video != "none" or self.rrd != "none"
