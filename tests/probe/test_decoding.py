@@ -1,6 +1,7 @@
 """What linear probes find in a memory: on made-up features, and on a policy of which it is known."""
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +86,15 @@ def test_a_file_that_is_another_one_is_refused_and_no_pickle_is_loaded(
     path = tmp_path / "a.npz"
     np.savez(path, **arrays)
     with pytest.raises(RunFolderError, match=says):
+        EpisodeMemory.read(path)
+
+
+def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("steps.npy", "w") as file:
+        for _ in range(1025):
+            file.write(bytes(2**20))
+    with pytest.raises(RunFolderError, match="expected at most 1073741824 bytes when unpacked"):
         EpisodeMemory.read(path)
 
 

@@ -27,6 +27,7 @@ from vla_eval.storage.folders import MEMORIES
 
 FRAME_PX = 16
 """Height and width of the frames: colours and places survive, texture does not."""
+MAX_BYTES = 2**30  # of a file when it is unpacked: more than a thousand inferences of any memory of ours
 MEMORY, FRAME, STEPS = "memory/", "frame/", "steps"
 
 
@@ -43,6 +44,10 @@ class EpisodeMemory:
     def read(cls, path: Path) -> "EpisodeMemory":
         """Read a file, without pickles; a `RunFolderError` if it is not one of these."""
         try:
+            with zipfile.ZipFile(path) as archive:
+                n_bytes = sum(member.file_size for member in archive.infolist())
+            if n_bytes > MAX_BYTES:
+                raise _refused(path, f"expected at most {MAX_BYTES} bytes when unpacked, found {n_bytes}")
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
         except (OSError, EOFError, ValueError, zipfile.BadZipFile) as exc:
