@@ -12,7 +12,8 @@ from tests.probe.test_changed_memory import TASK, probe, remembers, row
 from vla_eval.cli.main import main
 from vla_eval.errors import RunFolderError
 from vla_eval.evaluation.memory_log import EpisodeMemory, _small
-from vla_eval.probe.decoding import predicted
+from vla_eval.probe.decoding import _labels, predicted
+from vla_eval.records import EpisodeRecord
 
 __all__ = ["remembers"]
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -163,3 +164,21 @@ def test_too_few_episodes_say_nothing(remembers: Path, capsys: pytest.CaptureFix
     assert found["decoded"] == []
     assert [one["intervention"] for one in found["rows"]] == ["none"]  # without --probe, nothing else is run
     assert json.loads((remembers / "out" / f"{TASK}_none" / "run.json").read_text())["memories"]
+
+
+def test_a_label_with_one_answer_or_with_those_of_another_is_not_asked() -> None:
+    def record(seed: int, **fields: Any) -> EpisodeRecord:
+        return EpisodeRecord(
+            task=TASK, policy="p", n_action_steps=1, run=0, seed=seed, outcome="success", **fields
+        )
+
+    def names(*fields: dict[str, Any]) -> list[str]:
+        return [label.name for label in _labels([record(seed, **one) for seed, one in enumerate(fields)])]
+
+    apart = [{"target": i % 2, "target_place": i // 2, "right_candidates": (i % 2,)} for i in range(4)]
+    assert names(*apart) == ["item", "place"]
+    same = [{"target": i, "target_place": i, "right_candidates": (i,)} for i in range(3)]
+    assert names(*same) == ["item"]  # as in the shell game
+    several = [{"right_candidates": order} for order in ((0, 1, 2), (1, 0, 2), (2, 1, 0))]
+    assert names(*several) == ["item 1", "item 2", "item 3"]
+    assert names({"target": 1}, {"target": 1}) == []

@@ -120,7 +120,7 @@ def _episodes(records: Sequence[EpisodeRecord], folder: Path) -> list[tuple[Epis
 
 
 def _labels(records: Sequence[EpisodeRecord]) -> list[Label]:
-    """Return what is worth asking: a label with one answer alone says nothing."""
+    """Return what is worth asking: not what has one answer alone, nor the same answers as another label."""
     n_shown = max((len(record.right_candidates or ()) for record in records), default=0)
     asked = [
         Label(name="item", of=lambda record: record.target),
@@ -128,7 +128,11 @@ def _labels(records: Sequence[EpisodeRecord]) -> list[Label]:
     ]
     if n_shown > 1:
         asked += [Label(name=f"item {i + 1}", of=_shown_at(i)) for i in range(n_shown)]
-    return [label for label in asked if len({label.of(record) for record in records} - {None}) > 1]
+    by_answers = {
+        tuple(map(label.of, records)): label for label in reversed(asked)
+    }  # the first of a kind stays
+    worth = [label for answers, label in by_answers.items() if len(set(answers) - {None}) > 1]
+    return worth[::-1]
 
 
 def _shown_at(index: int) -> Callable[[EpisodeRecord], int | None]:
