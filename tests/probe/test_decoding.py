@@ -129,7 +129,10 @@ def test_what_a_policy_keeps_is_decoded_from_the_step_on_that_it_is_shown(
     assert (remembers / f"out_{TASK}_item_decoded.png").is_file()
 
     runs = [str(path) for path in sorted((remembers / "out").iterdir())]
-    sentence = f"at the response its memory holds the item in {N} of {N} episodes, and it acts on it in {N}"
+    sentence = (
+        f"at the response a linear probe reads the item from its memory in {N} of {N} episodes. Of these it "
+        f"follows the cue in {N}, of the other 0 in 0."
+    )
     assert main(["report", *runs]) == 0
     assert sentence in capsys.readouterr().out
     assert main(["report", *runs, "--html", str(remembers / "page")]) == 0
