@@ -18,8 +18,9 @@ def decoding_sentences(found: Sequence[Decoded]) -> list[str]:
     """Return a sentence for each policy and label that it can choose."""
     return [
         f"{one.policy} on {one.task}, K = {one.n_action_steps}: at the response a linear probe reads the "
-        f"{one.label} from its memory in {one.acts.both + one.acts.knows} of {one.acts.n} episodes. Of these it "
-        f"follows the cue in {one.acts.both}, of the other {one.acts.acts + one.acts.neither} in {one.acts.acts}."
+        f"{one.label} from its memory in {one.acts.both + one.acts.knows} of {one.acts.n} episodes. Of these "
+        f"it follows the cue in {one.acts.both}, of the other {one.acts.acts + one.acts.neither} in "
+        f"{one.acts.acts}."
         for one in found
         if one.acts is not None
     ]
