@@ -289,3 +289,21 @@ def test_an_evaluation_refuses_what_cannot_be_changed(
     said = capsys.readouterr()
     assert code in (1, 3)
     assert says in said.err + said.out
+
+
+def test_two_shards_merged_have_the_rows_of_one_run(
+    remembers: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ("--policy", str(remembers / "remembers.yaml"), "oracle", "--no-controls")
+    arguments += ("--probe", "transplant,carry_over")
+    whole = probe(remembers, capsys, *arguments, out="whole")
+    for shard in ("1/2", "2/2"):
+        fake = ["--workers", "1", "--set", "simulator=fake", "--set", "env.horizon_steps=45"]
+        command = ["probe", "--task", TASK, "--episodes", str(N), "--out", str(remembers / "parts"), *fake]
+        assert main([*command, *arguments, "--n-action-steps", "5", "--shard", shard]) == 0
+    folders = {path.name for path in remembers.glob("parts*/*")}
+    assert f"{TASK}_transplant_1" in folders
+    for name in sorted(folders):
+        parts = sorted(str(path) for path in remembers.glob(f"parts*/{name}"))
+        assert main(["merge", *parts, "--out", str(remembers / "merged" / name)]) == 0
+    assert probe(remembers, capsys, *arguments, out="merged") == whole
