@@ -11,9 +11,10 @@ import pytest
 from tests.probe.test_changed_memory import TASK, probe, remembers, row
 from vla_eval.cli.main import main
 from vla_eval.errors import RunFolderError
-from vla_eval.evaluation.memory_log import EpisodeMemory, _small
-from vla_eval.probe.decoding import _labels, predicted
+from vla_eval.evaluation.memory_log import EpisodeMemory, small
+from vla_eval.probe.decoding import _labels
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.linear_probe import predicted
 
 __all__ = ["remembers"]
 pytestmark = pytest.mark.usefixtures("in_this_process")
@@ -29,45 +30,54 @@ class TestProbe:
         labels = rng.integers(0, 3, 60)
         features = rng.normal(size=(60, 40))
         features[np.arange(60), labels] += 6.0
-        assert (predicted(features, labels, FOLDS) == labels).mean() >= 0.95
+        assert (predicted([features], labels, FOLDS) == labels).mean() >= 0.95
 
     def test_noise_of_many_features_is_at_chance_although_it_fits_what_it_was_fitted_on(self) -> None:
         rng = np.random.default_rng(1)
         labels = rng.integers(0, 3, 60)
-        right = (predicted(rng.normal(size=(60, 500)), labels, FOLDS) == labels).sum()
+        right = (predicted([rng.normal(size=(60, 500))], labels, FOLDS) == labels).sum()
         # 20 of 60 are expected; above 32 with a probability of less than 0.001.
         assert right <= 32
 
     def test_an_episode_is_never_predicted_by_its_own_answer(self) -> None:
         features = np.eye(60)  # a feature for each episode, which no other has
         labels = np.arange(60) % 2
-        assert (predicted(features, labels, FOLDS) == labels).mean() <= 0.5
+        assert (predicted([features], labels, FOLDS) == labels).mean() <= 0.5
 
     def test_what_is_not_finite_or_constant_counts_for_nothing(self) -> None:
         labels = np.arange(60) % 3
         features = np.zeros((60, 6))
         features[np.arange(60), labels] = 1.0
-        features[:, 3], features[:, 4], features[::7, 5] = np.inf, 1e30, np.nan
-        assert (predicted(features, labels, FOLDS) == labels).all()
+        features[:, 3], features[:, 4], features[::7, 5] = np.inf, -np.inf, np.nan
+        constant = np.full((60, 2), 1e30) + np.arange(60)[:, None]  # rounded away
+        assert (predicted([features, constant, np.zeros((60, 3))], labels, FOLDS) == labels).all()
 
-    def test_units_do_not_matter(self) -> None:
+    def test_units_of_a_part_do_not_matter_nor_how_many_numbers_another_has(self) -> None:
         rng = np.random.default_rng(2)
         labels = rng.integers(0, 3, 60)
-        features = rng.normal(size=(60, 8))
-        features[np.arange(60), labels] += 2.0
-        scaled = features * np.array([1e-6, 1e6, 1, 3, 1e3, 1, 1e-3, 1]) + 5
-        assert (predicted(features, labels, FOLDS) == predicted(scaled, labels, FOLDS)).all()
+        one, other = rng.normal(size=(60, 8)), rng.normal(size=(60, 400))
+        one[np.arange(60), labels] += 4.0
+        found = predicted([one, other], labels, FOLDS)
+        assert (found == labels).mean() >= 0.9
+        assert (predicted([one * 1e6 + 3, other * 1e-4], labels, FOLDS) == found).all()
+
+    def test_pixels_that_hardly_vary_do_not_drown_the_few_that_show_something(self) -> None:
+        rng = np.random.default_rng(3)
+        labels = rng.integers(0, 3, 60)
+        image = 100 + rng.normal(scale=0.5, size=(60, 3000))
+        image[np.arange(60), labels] += 60
+        assert (predicted([image], labels, FOLDS) == labels).all()
 
 
 def test_the_means_of_a_frame_are_over_equal_blocks() -> None:
     image = np.zeros((32, 48, 3), np.uint8)
     image[:2, :3] = 200
     image[2, 0] = 90
-    small = _small(image)
-    assert small.shape == (16, 16, 3)
-    assert (small[0, 0] == 200).all()
-    assert (small[1, 0] == 15).all()  # one of 2 x 3 pixels
-    assert small.sum() == 3 * 215
+    means = small(image, 16)
+    assert means.shape == (16, 16, 3)
+    assert (means[0, 0] == 200).all()
+    assert (means[1, 0] == 15).all()  # one of 2 x 3 pixels
+    assert means.sum() == 3 * 215
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,8 @@ first choice is final. The official package's tasks (--suite mikasa_vla_90) have
 (--suite mikasa_base) has no arm to hold, and controls of its own: 'random', 'memoryless', 'oracle'. The same
 command resumes a stopped audit."""
 
+EPISODES, STORED_FRAMES_EPISODES = 30, 100
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
@@ -41,6 +43,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="both",
         help="(both); official tasks and MIKASA-Base have their own",
     )
+    parser.add_argument(
+        "--stored-frames",
+        action="store_true",
+        help="ask how many frames have to be stored, by linear probes on the oracle's episodes (100)",
+    )
     add_flags(
         parser,
         *("--workers", "--cluster", "--shard", "--json-progress", "--allow-environment-change"),
@@ -48,7 +55,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         out="(runs/audit)",
         set="change another field of the evaluations, for example simulator=fake",
     )
-    parser.set_defaults(episodes=30, workers="auto", out=Path("runs/audit"))
+    parser.set_defaults(episodes=None, workers="auto", out=Path("runs/audit"))
     parser.add_argument("--format", choices=("markdown", "json"), default="markdown", help="(markdown)")
 
 
@@ -60,6 +67,9 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.tasks.catalog import task_spec
 
     tasks, settings = _tasks_and_settings(args)
+    if args.stored_frames:
+        return _run_stored_frames(args, tasks, settings)
+    args.episodes = EPISODES if args.episodes is None else args.episodes
     if all(task_spec(task).is_base for task in tasks):  # its controls and its verdict are others
         if args.protocol == "strict":
             raise RecipeError(
@@ -77,6 +87,24 @@ def run(args: argparse.Namespace) -> int:
         )
     configs = _configs(args, tasks, settings)
     return _evaluate(args, configs, lambda: render_audit(read_audit(configs, args.out), args.format))
+
+
+def _run_stored_frames(args: argparse.Namespace, tasks: tuple[str, ...], settings: dict[str, Any]) -> int:
+    from vla_eval.audit.stored_frames import read_stored_frames, render_stored_frames, stored_frames_config
+
+    if args.controls is not None or args.protocol != "both":
+        raise RecipeError(
+            "--stored-frames has one control and one protocol. Leave --control and --protocol out."
+        )
+    config = stored_frames_config(
+        tasks,
+        episodes=STORED_FRAMES_EPISODES if args.episodes is None else args.episodes,
+        workers=args.workers,
+        settings=settings,
+    )
+    return _evaluate(
+        args, (config,), lambda: render_stored_frames(read_stored_frames(config, args.out), args.format)
+    )
 
 
 def _evaluate(args: argparse.Namespace, configs: tuple[EvalConfig, ...], render: Callable[[], str]) -> int:

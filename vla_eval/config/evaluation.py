@@ -42,6 +42,8 @@ class CaptureConfig:
     strip: Which = "none"
     # whether each episode gets a file of what the policy remembers after each inference, if it has a memory
     memory: bool = False
+    # whether each episode gets a file of small frames, at each control step until the response
+    frames: bool = False
     frame_stride: Steps = 2  # control steps from one frame to the next
 
     def __post_init__(self) -> None:
@@ -62,7 +64,7 @@ class CaptureConfig:
     @property
     def writes_files(self) -> bool:
         """Whether workers write into the run folder."""
-        return self.is_on or self.memory
+        return self.is_on or self.memory or self.frames
 
     @property
     def needs_images(self) -> bool:

@@ -201,10 +201,14 @@ def _runner(bookkeeper: "_Bookkeeper") -> RunnerClass:
         folder = bookkeeper.folder.path.resolve()
         capture = EpisodeCapture(config=config.capture, folder=folder, seed_start=config.seed_start)
     asks_memory = config.world is not None and config.memory_change is None
-    kept = bookkeeper.folder.path.resolve() if config.capture.memory else None
-    return RunnerClass(
-        target=RUNNER, options={"capture": capture, "asks_memory": asks_memory, "memories_in": kept}
-    )
+    path = bookkeeper.folder.path.resolve()
+    options = {
+        "capture": capture,
+        "asks_memory": asks_memory,
+        "memories_in": path if config.capture.memory else None,
+        "frames_in": path if config.capture.frames else None,
+    }
+    return RunnerClass(target=RUNNER, options=options)
 
 
 def _run(

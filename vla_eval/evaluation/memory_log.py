@@ -1,4 +1,4 @@
-"""What a policy remembers after each inference, and what it saw: a file per episode, for linear probes."""
+"""What a policy remembers after each inference, and what there was to see: files for linear probes."""
 
 import os
 import zipfile
@@ -22,13 +22,13 @@ from vla_eval.core import (
 )
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.capture_files import memory_file
-from vla_eval.storage.folders import MEMORIES
+from vla_eval.storage.capture_files import frames_file, memory_file
+from vla_eval.storage.folders import FRAMES, MEMORIES
 
-FRAME_PX = 16
-"""Height and width of the frames: colours and places survive, texture does not."""
+FRAME_PX, LARGER_FRAME_PX = 16, 32
+"""Height and width of frames beside a memory, and alone: colours and places survive, texture does not."""
 MAX_BYTES = 2**30  # of a file when it is unpacked: more than a thousand inferences of any memory of ours
-MEMORY, FRAME, STEPS = "memory/", "frame/", "steps"
+MEMORY, FRAME, STEPS, IN_CUE = "memory/", "frame/", "steps", "in_cue"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +38,8 @@ class EpisodeMemory:
     steps: NDArray[np.int64]  # (T,) of the inferences
     # name -> (T, …) after each inference; arrays whose shape changes within the episode are not among them
     memory: Mapping[str, NDArray[Any]]
-    frames: Mapping[str, NDArray[np.uint8]]  # camera -> (T, 16, 16, 3) the newest frame at each inference
+    frames: Mapping[str, NDArray[np.uint8]]  # camera -> (T, px, px, 3) the newest frame at each inference
+    in_cue: NDArray[np.bool_] | None = None  # (T,) whether the cue is shown, where frames alone are kept
 
     @classmethod
     def read(cls, path: Path) -> "EpisodeMemory":
@@ -55,6 +56,9 @@ class EpisodeMemory:
         steps = arrays.pop(STEPS, None)
         if steps is None or steps.ndim != 1 or steps.dtype.kind != "i":
             raise _refused(path, f"expected '{STEPS}' with whole numbers (T,)")
+        in_cue = arrays.pop(IN_CUE, None)
+        if in_cue is not None and (in_cue.shape != steps.shape or in_cue.dtype != np.bool_):
+            raise _refused(path, f"'{IN_CUE}': expected {len(steps)} truth values")
         for name, array in arrays.items():
             if not name.startswith((MEMORY, FRAME)) or array.shape[:1] != steps.shape:
                 raise _refused(path, f"'{name}' {array.shape}: expected an array with {len(steps)} rows")
@@ -62,6 +66,7 @@ class EpisodeMemory:
                 raise _refused(path, f"'{name}': expected numbers, found {array.dtype}")
         return cls(
             steps=steps,
+            in_cue=in_cue,
             memory={n.removeprefix(MEMORY): a for n, a in arrays.items() if n.startswith(MEMORY)},
             frames={n.removeprefix(FRAME): a for n, a in arrays.items() if n.startswith(FRAME)},
         )
@@ -72,6 +77,7 @@ class _Log:
     steps: list[int] = field(default_factory=list)
     memories: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
     frames: list[Mapping[str, ImageArray]] = field(default_factory=list)
+    in_cue: list[bool] = field(default_factory=list)
 
 
 class MemoryLog(StepObserver):
@@ -98,34 +104,76 @@ class MemoryLog(StepObserver):
         log.steps.append(step)
         log.memories.append(self._policy.get_memory(episode.slot))
         images = self._newest[episode.slot].images
-        log.frames.append({camera: _small(image) for camera, image in images.items()})
+        log.frames.append({camera: small(image, FRAME_PX) for camera, image in images.items()})
 
     def write(self, starts: Sequence[EpisodeStart], records: Sequence[EpisodeRecord], folder: Path) -> None:
         """Write the file of each episode, whole or not at all."""
         (folder / MEMORIES).mkdir(exist_ok=True)
         for start, record in zip(starts, records, strict=True):
-            log, path = self._logs[start.slot], memory_file(folder, record)
-            arrays = {
-                **{f"{MEMORY}{name}": array for name, array in _stacked(log.memories).items()},
-                **{f"{FRAME}{name}": array for name, array in _stacked(log.frames).items()},
-            }
-            partial = path.with_suffix(".tmp.npz")
-            np.savez_compressed(partial, allow_pickle=False, **{STEPS: np.array(log.steps), **arrays})
-            os.replace(partial, path)
+            _write(self._logs[start.slot], memory_file(folder, record))
+
+
+class FrameLog(StepObserver):
+    """A `StepObserver` that keeps a small frame of each control step until the response, and of its first."""
+
+    def __init__(self) -> None:
+        """Nothing is written before `write`."""
+        self._logs: dict[int, _Log] = {}
+        self._waiting: set[int] = set()  # slots before the response
+
+    def wants_images(self, step: int) -> bool:
+        """Whether an episode is before its response."""
+        return step == 0 or bool(self._waiting)
+
+    def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
+        """Begin an episode."""
+        self._logs[episode.slot] = _Log()
+        self._waiting.add(episode.slot)
+        self._keep(episode.slot, result)
+
+    def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
+        """Keep the frame of this step."""
+        if episode.slot in self._waiting:
+            self._keep(episode.slot, result)
+
+    def _keep(self, slot: int, result: StepResult) -> None:
+        log, seen = self._logs[slot], result.observation
+        log.steps.append(seen.step)
+        log.in_cue.append(result.status.phase == "cue")
+        log.frames.append({camera: small(image, LARGER_FRAME_PX) for camera, image in seen.images.items()})
+        if result.status.phase == "response":
+            self._waiting.discard(slot)
+
+    def write(self, starts: Sequence[EpisodeStart], records: Sequence[EpisodeRecord], folder: Path) -> None:
+        """Write the file of each episode, whole or not at all."""
+        (folder / FRAMES).mkdir(exist_ok=True)
+        for start, record in zip(starts, records, strict=True):
+            _write(self._logs[start.slot], frames_file(folder, record))
+
+
+def _write(log: _Log, path: Path) -> None:
+    arrays = {
+        **{f"{MEMORY}{name}": array for name, array in _stacked(log.memories).items()},
+        **{f"{FRAME}{name}": array for name, array in _stacked(log.frames).items()},
+        **({IN_CUE: np.array(log.in_cue)} if log.in_cue else {}),
+    }
+    partial = path.with_suffix(".tmp.npz")
+    np.savez_compressed(partial, allow_pickle=False, **{STEPS: np.array(log.steps), **arrays})
+    os.replace(partial, path)
 
 
 def _stacked(rows: Sequence[Mapping[str, NDArray[Any]]]) -> dict[str, NDArray[Any]]:
     """Return the arrays that all rows have, in one shape, with an axis for the rows."""
     return {
         name: np.stack([row[name] for row in rows])
-        for name, first in rows[-1].items()
+        for name, first in (rows[-1] if rows else {}).items()
         if all(name in row and row[name].shape == first.shape for row in rows)
     }
 
 
-def _small(image: ImageArray) -> ImageArray:
-    """Return means over equal blocks, (16, 16, 3)."""
-    rows, columns = (np.linspace(0, side, FRAME_PX + 1).astype(int) for side in image.shape[:2])
+def small(image: ImageArray, px: int) -> ImageArray:
+    """Return means over equal blocks, (px, px, 3)."""
+    rows, columns = (np.linspace(0, side, px + 1).astype(int) for side in image.shape[:2])
     sums = np.add.reduceat(np.add.reduceat(image.astype(np.float64), rows[:-1], 0), columns[:-1], 1)
     counts = np.diff(rows)[:, None] * np.diff(columns)[None, :]
     means: ImageArray = np.round(sums / counts[..., None]).astype(np.uint8)

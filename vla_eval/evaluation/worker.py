@@ -36,7 +36,7 @@ from vla_eval.errors import (
 from vla_eval.evaluation.donors import donor_memories, donor_settings
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
-from vla_eval.evaluation.memory_log import MemoryLog
+from vla_eval.evaluation.memory_log import FrameLog, MemoryLog
 from vla_eval.memory_change import ChangedMemory, memory_parts
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.policies.compiled import CompiledPolicy
@@ -113,10 +113,12 @@ class EpisodeRunner:
         capture: EpisodeCapture | None = None,
         asks_memory: bool = False,
         memories_in: Path | None = None,
+        frames_in: Path | None = None,
     ) -> None:
         self._capture = capture
         self._asks_memory = asks_memory  # of the policy; False once the parent knows
         self._memories_in = memories_in  # the run folder, if what a policy remembers is kept
+        self._frames_in = frames_in  # the run folder, if small frames are kept
         self._heartbeat = heartbeat
         self._tell = tell
         self._env: SimEnv | None = None
@@ -181,6 +183,8 @@ class EpisodeRunner:
         if self._memories_in is not None and isinstance(policy, RememberingPolicy) and policy.spec.has_memory:
             memories = MemoryLog(policy)
             observers.append(memories)
+        frames = FrameLog() if self._frames_in is not None else None
+        observers += [frames] if frames is not None else []
         records = rollout(env, changed, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         if self._asks_memory:
             self._asks_memory = False
@@ -189,6 +193,8 @@ class EpisodeRunner:
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
         if memories is not None and self._memories_in is not None:
             memories.write(starts, named, self._memories_in)
+        if frames is not None and self._frames_in is not None:
+            frames.write(starts, named, self._frames_in)
         timings = self._heartbeat.timings([job.key for job in batch.jobs])
         if self._capture and tapes:
             self._capture.write(
@@ -263,7 +269,9 @@ class EpisodeRunner:
         """Return what the policy needs; and what is captured, which the loop does not give to it."""
         if self._is_live(group):
             return self._captured(group)
-        return dataclasses.replace(group.env, cameras=policy.spec.cameras, privileged=policy.spec.privileged)
+        every = tuple(camera.name for camera in group.offered.cameras)
+        cameras = policy.spec.cameras if self._frames_in is None else every
+        return dataclasses.replace(group.env, cameras=cameras, privileged=policy.spec.privileged)
 
     def _captured(self, group: EpisodeGroup) -> EnvSettings:
         assert self._capture is not None

@@ -19,15 +19,13 @@ from vla_eval.probe.quantities import Share, follows
 from vla_eval.probe.world_records import by_policy, results_of
 from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.linear_probe import Vectors, folds_of, predicted
 from vla_eval.storage.capture_files import memory_file
 from vla_eval.storage.run_folder import StoredRun, read_run
 from vla_eval.tasks.catalog import task_spec
 
-N_FOLDS = 5
 LEAST_EPISODES = 10  # at a step; with fewer nothing is fitted
 TIME = "time"  # the label that is the control step itself
-RIDGE = 0.1  # of the mean squared length of an episode's features, which is 1
-Vectors = NDArray[np.float64]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,14 +218,12 @@ def _share(
     return None if right is None else Share(int(right.sum()), len(right))
 
 
-def _features(rows: Sequence[tuple[Mapping[str, NDArray[Any]], int]]) -> Vectors | None:
-    """Return (N, D) of one row of each file's arrays, by name; None without arrays, or of several shapes."""
-    vectors = [
-        np.concatenate([np.zeros(0), *(arrays[name][row].ravel() for name in sorted(arrays))])
-        for arrays, row in rows
-    ]
-    is_one_shape = len({len(vector) for vector in vectors}) == 1 and len(vectors[0]) > 0
-    return np.array(vectors, np.float64) if is_one_shape else None
+def _features(rows: Sequence[tuple[Mapping[str, NDArray[Any]], int]]) -> list[Vectors]:
+    """Return (N, D) for each array that all files have in one shape, of one row of each file's."""
+    names = [name for name in sorted(rows[0][0]) if all(name in arrays for arrays, _ in rows)]
+    parts = [[arrays[name][row].ravel() for arrays, row in rows] for name in names]
+    same = [part for part in parts if len({len(one) for one in part}) == 1 and len(part[0])]
+    return [np.array(part, np.float64) for part in same]
 
 
 def _is_right(
@@ -235,45 +231,8 @@ def _is_right(
 ) -> NDArray[np.bool_] | None:
     """Return for each row whether the probe of the other folds is right; None without features."""
     features = _features(rows)
-    if features is None:
+    if not features:
         return None
     asked = np.array(labels)
-    right: NDArray[np.bool_] = predicted(features, asked, np.array(seeds) % N_FOLDS) == asked
+    right: NDArray[np.bool_] = predicted(features, asked, folds_of(seeds)) == asked
     return right
-
-
-def predicted(features: Vectors, labels: NDArray[np.int64], folds: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return what ridge regression on the other folds predicts for each row: the class of the largest number.
-
-    Args:
-        features: (N, D); numbers that are not finite count as 0 after standardising, as do constants.
-        labels: (N,) classes.
-        folds: (N,) the fold of each row.
-    """
-    found = np.full(len(labels), labels[0])
-    for fold in np.unique(folds):
-        test, train = folds == fold, folds != fold
-        if not train.any():
-            continue
-        finite = np.where(np.isfinite(features), features, np.nan)
-        with np.errstate(invalid="ignore"):
-            mean, spread = _moments(finite[train])
-            scaled = np.nan_to_num((finite - mean) / spread, nan=0.0, posinf=0.0, neginf=0.0)
-        scaled /= np.sqrt(max(float((scaled[train] ** 2).sum(axis=1).mean()), 1e-12))
-        classes = np.unique(labels[train])
-        targets = (labels[train][:, None] == classes[None, :]).astype(np.float64)
-        bias = targets.mean(axis=0)
-        kernel = scaled[train] @ scaled[train].T
-        weights = np.linalg.solve(kernel + RIDGE * np.eye(len(kernel)), targets - bias)
-        scores = bias + scaled[test] @ scaled[train].T @ weights
-        found[test] = classes[scores.argmax(axis=1)]
-    return found
-
-
-def _moments(rows: Vectors) -> tuple[Vectors, Vectors]:
-    """Return mean and standard deviation of each feature over the rows with a number; NaN for constants."""
-    known = ~np.isnan(rows)
-    n = np.maximum(known.sum(axis=0), 1)
-    mean = np.where(known, rows, 0.0).sum(axis=0) / n
-    spread = np.sqrt((np.where(known, rows - mean, 0.0) ** 2).sum(axis=0) / n)
-    return mean, np.where(spread > 1e-9 * np.maximum(np.abs(mean), 1e-30), spread, np.nan)

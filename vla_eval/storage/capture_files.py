@@ -1,9 +1,9 @@
-"""What the files of an episode that was captured are called: video, rerun file, strip, memory."""
+"""What the files of an episode that was captured are called: video, rerun file, strip, memory, frames."""
 
 from pathlib import Path
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.folders import MEMORIES, RRDS, STRIPS, VIDEOS
+from vla_eval.storage.folders import FRAMES, MEMORIES, RRDS, STRIPS, VIDEOS
 
 
 def capture_stem(record: EpisodeRecord) -> str:
@@ -42,3 +42,8 @@ def strip_file(folder: Path, record: EpisodeRecord) -> Path:
 def memory_file(folder: Path, record: EpisodeRecord) -> Path:
     """Return where the file of what a policy remembered in an episode is, or would be."""
     return folder / MEMORIES / f"{capture_stem(record)}.npz"
+
+
+def frames_file(folder: Path, record: EpisodeRecord) -> Path:
+    """Return where the file of an episode's small frames is, or would be."""
+    return folder / FRAMES / f"{capture_stem(record)}.npz"

@@ -11,8 +11,9 @@ from vla_eval.storage.run_file import RUN_FILE
 EPISODES_FILE = "episodes.jsonl"
 TIMINGS_FILE = "timings.jsonl"
 LOCK_FILE = "run.lock"
-LOGS, VIDEOS, RRDS, STRIPS, MEMORIES = "logs", "videos", "rrd", "strips", "memories"
-SUBFOLDERS = (LOGS, VIDEOS, RRDS, STRIPS, MEMORIES)
+LOGS, VIDEOS, RRDS, STRIPS = "logs", "videos", "rrd", "strips"
+MEMORIES, FRAMES = "memories", "frames"
+SUBFOLDERS = (LOGS, VIDEOS, RRDS, STRIPS, MEMORIES, FRAMES)
 # What a process that was killed before it wrote run.json may have left behind.
 UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 
