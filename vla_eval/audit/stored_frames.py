@@ -1,13 +1,13 @@
 """How much has to be stored: is one frame enough, or does it take several?
 
-The `oracle` runs each task with arm and gripper held until the response (the strict rule), and small frames
+The `oracle` runs each task with arm and gripper held until the response, and small frames
 of each control step are kept. Linear probes say what was shown: from the newest frame and one stored frame,
 or from all frames. `docs/audit.md` defines the verdicts.
 """
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -22,7 +22,6 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import PairCounts, mcnemar_exact, p_above, wilson_interval
 from vla_eval.results.linear_probe import Vectors, folds_of, predicted
 from vla_eval.results.printed_table import Column, PrintedTable, cells_of, write_tables
-from vla_eval.results.shipped_audit import PROTOCOLS
 from vla_eval.storage.capture_files import frames_file
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
@@ -81,9 +80,9 @@ def stored_frames_config(
             f"{', '.join(tasks)}."
         )
     is_official = all(task_spec(task).is_official for task in shown)
-    fields = {**(OFFICIAL_FIELDS if is_official else {}), **settings}
-    rule = {} if is_official else PROTOCOLS["strict"].arguments
-    env = fields.pop("env", {})
+    own = {**(OFFICIAL_FIELDS if is_official else {}), **settings}
+    rule = {} if is_official else {"freeze_until_choice": True}
+    env = own.pop("env", {})
     return EvalConfig(
         name=NAME,
         tasks=shown,
@@ -93,7 +92,7 @@ def stored_frames_config(
         workers=workers,
         env={**rule, **env},
         capture=CaptureConfig(frames=True),
-        **{"stop_at_success": True, **fields},
+        **{"stop_at_success": True, **own},
     )
 
 
@@ -165,7 +164,7 @@ def verdict(best: Right, everything: Right, chance: float) -> str:
 def render_stored_frames(rows: Sequence[StoredFrames], style: Literal["markdown", "json"]) -> str:
     """Return the table."""
     if style == "json":
-        return json.dumps([asdict(row) for row in rows], indent=2)
+        return json.dumps([_json(row) for row in rows], indent=2)
     notes = [
         "Share of episodes in which linear probes are right in all that is asked; each episode is predicted "
         "by probes of other seeds. set: which items; order: in the order shown.",
@@ -173,6 +172,11 @@ def render_stored_frames(rows: Sequence[StoredFrames], style: Literal["markdown"
         f"{ALPHA}); {UNREAD}: neither is above chance.",
     ]
     return write_tables([PrintedTable(columns=_COLUMNS, rows=cells_of(_COLUMNS, rows), notes=notes)], style)
+
+
+def _json(row: StoredFrames) -> dict[str, Any]:
+    values = {one.name: getattr(row, one.name) for one in fields(row)}
+    return {name: v._asdict() if isinstance(v, Answer) else v for name, v in values.items()}
 
 
 def _answers(record: EpisodeRecord, asked: Asked) -> tuple[int, ...]:
