@@ -30,6 +30,7 @@ NAME = "audit_stored_frames"
 CONTROL = "oracle"
 MOST_FRAMES = 24  # of all frames, evenly spread, in the probe that gets them all
 ALPHA = 0.01  # of each test
+READ = 0.9  # share of episodes; with less, a verdict would be about the probe
 LEAST_EPISODES = 20
 
 ONE, SEVERAL, UNREAD = "one stored frame is enough", "several frames", "not read by linear probes"
@@ -148,7 +149,7 @@ def _row(task: str, asked: Asked, episodes: Sequence[tuple[EpisodeRecord, Episod
 def verdict(best: Right, everything: Right, chance: float) -> str:
     """Return what the two probes say: from the newest and the best stored frame, and from all frames."""
     most = max(int(best.sum()), int(everything.sum()))
-    if p_above(most, len(best), chance) >= ALPHA:
+    if most < READ * len(best) or p_above(most, len(best), chance) >= ALPHA:
         return UNREAD
     pairs = PairCounts(
         both=int((best & everything).sum()),
@@ -169,7 +170,7 @@ def render_stored_frames(rows: Sequence[StoredFrames], style: Literal["markdown"
         "Share of episodes in which linear probes are right in all that is asked; each episode is predicted "
         "by probes of other seeds. set: which items; order: in the order shown.",
         f"{ONE}: all frames together are not better than the newest and one other (exact McNemar test, "
-        f"{ALPHA}); {UNREAD}: neither is above chance.",
+        f"{ALPHA}); {UNREAD}: neither is right in {READ:.0%} of the episodes, and above chance.",
     ]
     return write_tables([PrintedTable(columns=_COLUMNS, rows=cells_of(_COLUMNS, rows), notes=notes)], style)
 
