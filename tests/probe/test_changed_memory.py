@@ -11,9 +11,11 @@ from vla_eval.cli.main import main
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.memory_change import KINDS
 from vla_eval.probe.interventions import INTERVENTIONS, plan_later, plan_probe
+from vla_eval.probe.phases import fixed_phases, n_cue_frames_after
 from vla_eval.probe.worlds import ProbeSettings
 from vla_eval.results.cells import markdown_text
 from vla_eval.storage.run_folder import read_run
+from vla_eval.tasks.catalog import task_spec
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -136,6 +138,7 @@ def test_every_change_has_the_effect_that_follows_from_the_policy(
 
     for unchanged in (("memory_noise", "0"), ("hold_memory", 5), ("erase_memory", "shown/n")):
         assert row(found, *unchanged)["p_value"] == 1.0
+    assert not any("frames of the cue after" in note for note in found["notes"])  # K = 5, a delay of 5
     (sentence,) = found["sentences"]
     assert f"put in at the response in 0 of {N} (chance 2), and that memory in {N} of {N}" in sentence
 
@@ -307,3 +310,25 @@ def test_two_shards_merged_have_the_rows_of_one_run(
         parts = sorted(str(path) for path in remembers.glob(f"parts*/{name}"))
         assert main(["merge", *parts, "--out", str(remembers / "merged" / name)]) == 0
     assert probe(remembers, capsys, *arguments, out="merged") == whole
+
+
+@pytest.mark.parametrize(
+    ("task", "k", "n_frames"),
+    [
+        # Cue at steps 0 to 4, response from 10 on: the inference before that of step 10 (16) is at 5 (8).
+        *(("RememberColor3-v0", k, 0) for k in (1, 5, 8)),
+        ("RememberColor3-v0", 10, 4),  # 0, then 10: frames 1 to 4 come with it
+        ("RememberColor3-v0", 12, 4),
+        # Cue at steps 0 to 4, response from 5 on.
+        ("ShellGameTouch-v0", 1, 0),
+        ("ShellGameTouch-v0", 4, 0),  # 4, then 8
+        ("ShellGameTouch-v0", 5, 4),
+        ("ShellGameTouch-v0", 8, 4),  # 0, then 8
+        ("ShellGameTouch-v0", 2, 0),  # 4, then 6
+        ("ShellGameTouch-v0", 3, 1),  # 3, then 6: frame 4
+    ],
+)
+def test_frames_of_the_cue_that_are_shown_after_the_change_are_counted(
+    task: str, k: int, n_frames: int
+) -> None:
+    assert n_cue_frames_after(fixed_phases(task_spec(task), {}), k) == n_frames

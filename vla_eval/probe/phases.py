@@ -83,6 +83,17 @@ def fixed_phases(spec: TaskSpec, env: Mapping[str, Any]) -> Phases:  # Any: a ta
     return phases
 
 
+def n_cue_frames_after(phases: Phases, interval_steps: int) -> int:
+    """Return how many frames of the cue a policy is shown after a change of its memory at the response.
+
+    The change is made before the first inference of the response, at which a policy that reads every frame is
+    shown those since the inference before.
+    """
+    late = (-phases.response_step) % interval_steps
+    before = phases.response_step + late - interval_steps
+    return sum(phases.shows_at(step) for step in range(max(before + 1, 0), phases.cue_end_step))
+
+
 def divides(phases: Phases, n_action_steps: int) -> bool:
     """Whether each phase, and each item of the cue, begins with an inference if the first one is at 0."""
     turn_steps = phases.cue_steps + phases.gap_steps

@@ -119,8 +119,25 @@ def _steps(steps: float | None, half: HalfLife) -> str:
 
 def notes(table: ProbeTable) -> list[str]:
     """Return the notes that a reader of the table needs, errors and failed controls included."""
-    found = [*_columns(table.rows), *_failed_controls(table.rows), *_chunk_and_phase(table.rows)]
+    found = [
+        *_columns(table.rows),
+        *_shown_after(table.rows),
+        *_failed_controls(table.rows),
+        *_chunk_and_phase(table.rows),
+    ]
     return [*found, *error_notes(table.n_errors)]
+
+
+def _shown_after(rows: Sequence[ProbeRow]) -> Iterator[str]:
+    """Say where the cue is seen again after a change of the memory, so that this is no clean change."""
+    found = dict.fromkeys((row.task, row.n_action_steps, row.n_cue_frames_after) for row in rows)
+    for task, k, n_frames in found:
+        if n_frames:
+            yield (
+                f"{task}, K = {k}: a policy that reads every frame is shown {n_frames} frames of the cue "
+                "after its memory is changed, together with the first frame of the response. A smaller "
+                "n_action_steps shows fewer; 1 shows none."
+            )
 
 
 def _columns(rows: Sequence[ProbeRow]) -> Iterator[str]:

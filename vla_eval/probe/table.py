@@ -9,7 +9,7 @@ import numpy as np
 from vla_eval.probe.decoding import Decoded, decoded_memories
 from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
-from vla_eval.probe.phases import Inferences, Phases, inferences, phases_of
+from vla_eval.probe.phases import Inferences, Phases, inferences, n_cue_frames_after, phases_of
 from vla_eval.probe.quantities import Pair, Share, SwapQuantities, follows, pair_up, paired_p, swap_quantities
 from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
@@ -24,6 +24,7 @@ from vla_eval.probe.world_records import (
 )
 from vla_eval.probe.worlds import (
     AS_DRAWN,
+    AT_RESPONSE,
     SWAPS,
     WITHOUT_MEMORY,
     Intervention,
@@ -67,6 +68,8 @@ class ProbeRow:
     left: tuple[float, Range] | None
     # episodes that follow the memory that was put in, of those in which it is another one than the cue's
     followed_memory: Share | None
+    # frames of the cue that are shown after the memory is changed; 0 where it is not changed at the response
+    n_cue_frames_after: int
     # exact paired test against that world; corrected_p: after Holm, over the table
     p_value: float | None
     corrected_p: float | None
@@ -188,6 +191,11 @@ def _row(world: World, found: Records, worlds: Worlds, policy: str, k: int) -> P
         followed_memory=Share.of_records(
             told_apart, lambda record: record.first_choice == targets[record.run, record.seed]
         ),
+        n_cue_frames_after=(
+            n_cue_frames_after(phases, k)
+            if isinstance(phases, Phases) and world.intervention in AT_RESPONSE
+            else 0
+        ),
         left=share_left(*_followed(pairs)) if compared and pairs else None,
         p_value=p_value,
         corrected_p=None,
@@ -216,6 +224,7 @@ def _row_without_memory(drawn: ProbeRow) -> ProbeRow:
         over_delay=None,
         left=None,
         followed_memory=None,
+        n_cue_frames_after=0,
         p_value=None,
         corrected_p=None,
         n_errors=0,

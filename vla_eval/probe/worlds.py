@@ -16,6 +16,8 @@ Intervention = str
 AS_DRAWN: Intervention = "none"
 WITHOUT_MEMORY: Intervention = "no memory"
 """In place of one, in the row of a policy without a memory that could be changed."""
+AT_RESPONSE: tuple[Intervention, ...] = ("transplant", "memory_noise", "erase_memory")
+"""Interventions that change the memory once, before the first inference of the response."""
 SWAPS: tuple[Intervention, ...] = ("swap", "order", "delay_swap")
 """Interventions whose worlds have another right answer than the world that they are compared with."""
 
