@@ -184,7 +184,7 @@ def _decoded(
 
 
 def _time(episodes: _Episodes, phases: Phases, *, task: str, policy: str, k: int) -> Decoded | None:
-    """Return how often the step can be told from the memory, at the inferences before the response."""
+    """Return how often a probe names the step, at the inferences before the response."""
     waiting = [
         (record, memory, row, int(step))
         for record, memory in episodes

@@ -1,4 +1,4 @@
-"""A linear probe: what can be told from some numbers of an episode. Pure functions of arrays."""
+"""A linear probe: what some numbers of an episode say of it. Pure functions of arrays."""
 
 from collections.abc import Sequence
 

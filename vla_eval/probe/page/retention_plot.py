@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from vla_eval.page.charts import Curves, Point, Series, curves_png
-from vla_eval.probe.decoding_text import decoding_curves
+from vla_eval.probe.page.memory_plot import decoding_curves
 from vla_eval.probe.page.png_files import write_beside
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeTable

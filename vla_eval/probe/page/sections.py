@@ -12,10 +12,11 @@ from vla_eval.page.probe_section import FilmFrame, FilmPair, Filmstrip, ProbeSec
 from vla_eval.page.rates import Plots, Sign
 from vla_eval.page.tables import Matrix, page_table, shaded
 from vla_eval.probe.choice_pairs import ChoicePairs
-from vla_eval.probe.decoding_text import decoding_curves, printed_decoding
+from vla_eval.probe.decoding_text import printed_decoding
 from vla_eval.probe.find_worlds import Found, FoundProbe, find_probes
 from vla_eval.probe.grid_text import grid_notes, grid_sentences, printed_grid
 from vla_eval.probe.page.heat_maps import heat_maps
+from vla_eval.probe.page.memory_plot import decoding_curves
 from vla_eval.probe.page.retention_plot import CURVES, by_kind, line_colors, line_name, retention_lines
 from vla_eval.probe.probe_text import printed_probe
 from vla_eval.probe.sentences import half_life_text, notes, sentences
