@@ -57,7 +57,8 @@ NOT_EXECUTED: Mapping[str, str] = {
 }
 """Command -> what it needs that is not here, and which tests run the like."""
 SLOW = (
-    r"audit .*strict.*|audit --stored-frames.*|check (DIR --task|my).*|dataset convert data/npz.*|merge .*|record .*--shard .*"
+    r"audit --stored-frames.*|"
+    r"audit .*strict.*|check (DIR --task|my).*|dataset convert data/npz.*|merge .*|record .*--shard .*"
     r"|finetune (paper|ablations).*|finetune --policy (openvla|pi0|spatialvla).*|report .*--html.*"
     r"|bench --loader.*|probe .*(=runs/|memory_|grid|probe --).*"
 )

@@ -1,4 +1,4 @@
-"""A linear probe: what some numbers of an episode say of it. Pure functions of arrays."""
+"""A linear probe: the class of an episode from some of its numbers. Pure functions of arrays."""
 
 from collections.abc import Sequence
 
