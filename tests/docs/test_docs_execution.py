@@ -53,11 +53,11 @@ NOT_EXECUTED: Mapping[str, str] = {
     r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/(memory|base_table)/.*": (
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
+    r"audit --stored-frames.*": "twenty episodes at least; tests/audit/test_stored_frames.py",
     r"serve --policy pi05 .*": "fetched weights and a GPU; tests/cli/test_serve.py",
 }
 """Command -> what it needs that is not here, and which tests run the like."""
 SLOW = (
-    r"audit --stored-frames.*|"
     r"audit .*strict.*|check (DIR --task|my).*|dataset convert data/npz.*|merge .*|record .*--shard .*"
     r"|finetune (paper|ablations).*|finetune --policy (openvla|pi0|spatialvla).*|report .*--html.*"
     r"|bench --loader.*|probe .*(=runs/|memory_|grid|probe --).*"
