@@ -6,9 +6,8 @@ unexport PYTHONDONTWRITEBYTECODE
 .PHONY: help setup demo suite90 base rl test test-all rehearse gpu-check lint docs bench clean
 
 BIN := .venv/bin
-# Each takes about 2 GB, and 10 s to start. Two more than two cores, where memory allows: in half of their time
-# tests wait for processes that they start and stop.
-TEST_PROCESSES ?= $(shell awk '/^MemAvailable/ {print ($$2 > 14000000) ? 4 : 3}' /proc/meminfo)
+# Each takes about 2 GB, and 10 s to start. One more than two cores: tests wait for processes that they stop.
+TEST_PROCESSES ?= 3
 PYTEST := $(BIN)/python -m pytest --numprocesses $(TEST_PROCESSES) --dist worksteal
 
 help:  ## list these verbs
