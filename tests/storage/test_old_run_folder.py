@@ -57,7 +57,7 @@ def test_the_same_command_resumes_it(run: Path, caplog: pytest.LogCaptureFixture
     assert (run / "videos" / f"{CAPTURED.replace('seed1', 'seed2')}.mp4").exists()
     sessions = json.loads((run / "run.json").read_text(encoding="utf-8"))["sessions"]
     assert sessions[0]["options"]["recording"] == {"video": 1, "rrd": 1, "frame_stride": 2}
-    now = {"video": 2, "rrd": 1, "strip": "none", "frame_stride": 2}
+    now = {"video": 2, "rrd": 1, "strip": "none", "memory": False, "frames": False, "frame_stride": 2}
     assert sessions[1]["options"]["capture"] == now
 
 

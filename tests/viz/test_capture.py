@@ -296,7 +296,7 @@ def test_a_run_captures_what_it_was_asked_to_and_nothing_else(tmp_path: Path) ->
         assert rrd_file(folder, record).exists() == (record.seed == 1)
         assert stills_file(folder, record).exists() == (record.key in failures)
     assert "capture" not in run.description.config
-    assert run.description.options["capture"] == capture | {"strip": "none"}
+    assert run.description.options["capture"] == capture | {"strip": "none", "memory": False, "frames": False}
 
 
 @pytest.mark.parametrize(("which", "outcome"), [("failures", "failure"), ("successes", "success")])
