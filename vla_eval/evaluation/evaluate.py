@@ -196,12 +196,11 @@ def _run_phases(plan: Plan, bookkeeper: "_Bookkeeper", finished: Collection[Epis
 
 def _runner(bookkeeper: "_Bookkeeper") -> RunnerClass:
     config = bookkeeper.resolved.config
+    path = bookkeeper.folder.path.resolve()
     capture = None
     if config.capture.is_on:
-        folder = bookkeeper.folder.path.resolve()
-        capture = EpisodeCapture(config=config.capture, folder=folder, seed_start=config.seed_start)
+        capture = EpisodeCapture(config=config.capture, folder=path, seed_start=config.seed_start)
     asks_memory = config.world is not None and config.memory_change is None
-    path = bookkeeper.folder.path.resolve()
     options = {
         "capture": capture,
         "asks_memory": asks_memory,

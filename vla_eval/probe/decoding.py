@@ -94,6 +94,8 @@ def kept_nothing(worlds: Sequence[World], out: Path) -> list[str]:
     """Return a line for each world as drawn in which memories were not kept."""
     lines = []
     for world in worlds:
+        if world.intervention != AS_DRAWN:
+            continue
         run = read_run(out / world.config.name)
         memories = run.description.memories
         missing = [
@@ -101,7 +103,7 @@ def kept_nothing(worlds: Sequence[World], out: Path) -> list[str]:
             for record in results_of(run.records)
             if memories.get(record.policy) and not memory_file(run.path, record).is_file()
         ]
-        if world.intervention == AS_DRAWN and missing:
+        if missing:
             lines.append(
                 f"{run.path}: {len(missing)} of {len(run.records)} episodes were run without --decode, and "
                 "of their memory nothing was kept: remove the folder to run them again."

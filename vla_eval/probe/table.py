@@ -145,7 +145,7 @@ def probe_table(
             own = [_row(world, found, of_task, policy, k) for world, found in ran]
             rows += with_contrasts(own, ran)
             if (task, policy) in without_memory:
-                rows.append(_row_without_memory(own[0]))
+                rows.append(_row_without_memory(ran[0][0], policy, k))
             retention += retention_curves(of_task, policy, k)
     tested = [row.p_value for row in rows if row.p_value is not None]
     corrected = iter(holm(tested))
@@ -203,32 +203,10 @@ def _row(world: World, found: Records, worlds: Worlds, policy: str, k: int) -> P
     )
 
 
-def _row_without_memory(drawn: ProbeRow) -> ProbeRow:
-    """Return the row that says so, beside a policy's row of the world as drawn."""
-    return ProbeRow(
-        task=drawn.task,
-        policy=drawn.policy,
-        n_action_steps=drawn.n_action_steps,
-        intervention=WITHOUT_MEMORY,
-        level=None,
-        delay_steps=drawn.delay_steps,
-        inferences=None,
-        n_pairs=0,
-        swap=None,
-        followed=None,
-        n_without_choice=None,
-        success=None,
-        chance=None,
-        mistakes=None,
-        kept=None,
-        over_delay=None,
-        left=None,
-        followed_memory=None,
-        n_cue_frames_after=0,
-        p_value=None,
-        corrected_p=None,
-        n_errors=0,
-    )
+def _row_without_memory(drawn: World, policy: str, k: int) -> ProbeRow:
+    """Return the row that says so: of a world in which nothing was run."""
+    world = replace(drawn, intervention=WITHOUT_MEMORY)
+    return replace(_row(world, {}, (), policy, k), inferences=None)
 
 
 def with_contrasts(rows: Sequence[ProbeRow], worlds: Worlds) -> list[ProbeRow]:
