@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 
 from vla_eval.evaluation.memory_log import EpisodeMemory
 from vla_eval.probe.phases import Phases, phases_of
-from vla_eval.probe.quantities import Share, follows
+from vla_eval.probe.quantities import follows
 from vla_eval.probe.world_records import by_policy, results_of
 from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.estimates import Share
 from vla_eval.results.linear_probe import Vectors, folds_of, predicted
 from vla_eval.storage.capture_files import memory_file
 from vla_eval.storage.run_folder import StoredRun, read_run

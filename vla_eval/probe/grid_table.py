@@ -6,10 +6,10 @@ from pathlib import Path
 
 from vla_eval.probe.grid import CONTROLS, CUE_READER, ORACLE, Axis, GridWorld
 from vla_eval.probe.phases import Inferences, inferences
-from vla_eval.probe.quantities import Share, follows, wilson_of_rate
+from vla_eval.probe.quantities import follows, wilson_of_rate
 from vla_eval.probe.world_records import Records, by_policy, results_of
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.estimates import Interval
+from vla_eval.results.estimates import Interval, Share
 from vla_eval.storage.run_folder import read_run
 
 _Run = tuple[GridWorld, Records]
@@ -156,8 +156,8 @@ def _part(world: GridWorld, records: Sequence[EpisodeRecord], k: int, reads_ever
         first_inference_step=world.first_inference_step,
         inferences=found,
         n_seen=None if reads_every is None else n_frames if reads_every else len(found.cue_steps),
-        success=Share.of_records(results, lambda record: bool(record.success_once)),
-        followed=Share.of_records(results, follows),
+        success=Share.counted(results, lambda record: bool(record.success_once)),
+        followed=Share.counted(results, follows),
         n_errors=len(records) - len(results),
     )
 

@@ -8,14 +8,13 @@ from vla_eval.probe.decoding_text import decoding_json, printed_decoding
 from vla_eval.probe.find_worlds import find_probes
 from vla_eval.probe.grid_text import render_grid
 from vla_eval.probe.mistakes import MISTAKES, Mistakes
-from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import Range
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.sentences import notes, sentences
 from vla_eval.probe.table import ProbeRow, ProbeTable
 from vla_eval.probe.text_table import JsonRow, rows_as_csv, shown_rate, success_json
 from vla_eval.results.cells import markdown_text
-from vla_eval.results.estimates import Interval
+from vla_eval.results.estimates import Interval, Share
 from vla_eval.results.formats import Format
 from vla_eval.results.own_statistics import rate
 from vla_eval.results.printed_table import (

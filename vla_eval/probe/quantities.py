@@ -12,7 +12,7 @@ from typing import Literal, NamedTuple
 import scipy
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.estimates import CONFIDENCE, Interval, PairCounts, mcnemar_exact, wilson_interval
+from vla_eval.results.estimates import CONFIDENCE, Interval, PairCounts, Share, mcnemar_exact
 from vla_eval.tasks.spec import TaskSpec
 
 CUE_IN_STATE = frozenset({"vla_eval.tasks.rotate:RotateEnv"})
@@ -23,32 +23,6 @@ ChangeOf = Literal["choice", "set", "angle", "actions"]
 ANGLE_TOLERANCE_RAD = 0.1
 """Of Rotate's success rule: angles nearer to each other are one answer. Those of a swap are twice as far
 apart, or more."""
-
-
-class Share(NamedTuple):
-    """How many of how many, with its interval."""
-
-    n: int
-    of: int
-
-    @classmethod
-    def of_records(
-        cls, records: Sequence[EpisodeRecord], holds: Callable[[EpisodeRecord], bool]
-    ) -> "Share | None":
-        """Return the share of episodes for which something holds; None without an episode."""
-        return cls(sum(map(holds, records)), len(records)) if records else None
-
-    @property
-    def rate(self) -> float:
-        """The share."""
-        return self.n / self.of
-
-    @property
-    def interval(self) -> Interval:
-        """The Wilson interval at 95 %."""
-        found = wilson_interval(self.n, self.of)
-        assert found is not None  # a share is of at least one
-        return found
 
 
 class Pair(NamedTuple):

@@ -6,10 +6,11 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from vla_eval.probe.quantities import Share, follows, pair_up
+from vla_eval.probe.quantities import follows, pair_up
 from vla_eval.probe.retention import HalfLife, half_life
 from vla_eval.probe.world_records import Worlds, chance_of, compared_with, results_of
 from vla_eval.probe.worlds import AS_DRAWN, delay_of
+from vla_eval.results.estimates import Share
 
 RetentionOf = Literal["follows", "warranted_choice"]
 LEAST_POINTS = 2

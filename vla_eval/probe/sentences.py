@@ -5,12 +5,12 @@ from collections.abc import Iterator, Sequence
 from vla_eval.probe.grid import ORACLE
 from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import MISTAKES
-from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import HalfLife
 from vla_eval.probe.retention_curves import Retention
 from vla_eval.probe.table import ProbeRow, ProbeTable
 from vla_eval.probe.text_table import error_notes
 from vla_eval.probe.worlds import AS_DRAWN, CONTROLS, CONTROLS_OF_ONE, SWAPS, WITHOUT_MEMORY
+from vla_eval.results.estimates import Share
 
 LEAST_MISTAKES = 5  # with fewer, their kinds say nothing
 

@@ -10,7 +10,7 @@ from vla_eval.probe.decoding import Decoded, decoded_memories
 from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, n_cue_frames_after, phases_of
-from vla_eval.probe.quantities import Pair, Share, SwapQuantities, follows, pair_up, paired_p, swap_quantities
+from vla_eval.probe.quantities import Pair, SwapQuantities, follows, pair_up, paired_p, swap_quantities
 from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
 from vla_eval.probe.world_records import (
@@ -34,7 +34,7 @@ from vla_eval.probe.worlds import (
     label_of,
 )
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.estimates import holm
+from vla_eval.results.estimates import Share, holm
 from vla_eval.results.grouping import config_names
 from vla_eval.storage.run_folder import StoredRun, read_run
 from vla_eval.tasks.catalog import task_spec
@@ -181,14 +181,14 @@ def _row(world: World, found: Records, worlds: Worlds, policy: str, k: int) -> P
         inferences=inferences(phases, k) if isinstance(phases, Phases) else None,
         n_pairs=len(pairs),
         swap=swap,
-        followed=Share.of_records(results, follows),
+        followed=Share.counted(results, follows),
         n_without_choice=sum(record.first_choice is None for record in choosing) if choosing else None,
-        success=Share.of_records(results, lambda record: bool(record.success_once)),
+        success=Share.counted(results, lambda record: bool(record.success_once)),
         chance=chance_of(results, found, k),
         mistakes=mistakes(results, task_spec(world.task)),
         kept=capacity(results),
         over_delay=None,
-        followed_memory=Share.of_records(
+        followed_memory=Share.counted(
             told_apart, lambda record: record.first_choice == targets[record.run, record.seed]
         ),
         n_cue_frames_after=(

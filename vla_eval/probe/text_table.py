@@ -3,9 +3,8 @@
 from collections.abc import Sequence
 from typing import Any
 
-from vla_eval.probe.quantities import Share
 from vla_eval.probe.retention import Range
-from vla_eval.results.estimates import Interval
+from vla_eval.results.estimates import Interval, Share
 from vla_eval.results.printed_table import UNDEFINED, csv_text
 
 JsonRow = dict[str, Any]  # Any: JSON

@@ -6,14 +6,16 @@ is None, never 0. Knows nothing of episodes, tasks or files.
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import scipy
 
 CONFIDENCE = 0.95
 LEVEL = 0.05  # of tests
+
+T = TypeVar("T")
 
 
 class Interval(NamedTuple):
@@ -71,6 +73,35 @@ def wilson_interval(n_success: int, n_episodes: int) -> Interval | None:
         return None
     found = scipy.stats.binomtest(n_success, n_episodes).proportion_ci(CONFIDENCE, method="wilson")
     return Interval(float(found.low), float(found.high))
+
+
+class Share(NamedTuple):
+    """How many of how many, with its interval."""
+
+    n: int
+    of: int
+
+    @classmethod
+    def counted(cls, items: Sequence[T], holds: Callable[[T], bool]) -> "Share | None":
+        """Return the share of items for which something holds; None without an item."""
+        return cls(sum(map(holds, items)), len(items)) if items else None
+
+    @property
+    def rate(self) -> float:
+        """The share."""
+        return self.n / self.of
+
+    @property
+    def interval(self) -> Interval:
+        """The Wilson interval at 95 %."""
+        found = wilson_interval(self.n, self.of)
+        assert found is not None  # a share is of at least one
+        return found
+
+    def __str__(self) -> str:
+        """Return `0.93 [0.84, 0.97]`."""
+        low, high = self.interval
+        return f"{self.rate:.2f} [{low:.2f}, {high:.2f}]"
 
 
 def mean_interval(counts: Sequence[tuple[int, int]]) -> Interval:
