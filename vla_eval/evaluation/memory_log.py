@@ -24,11 +24,12 @@ from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.capture_files import frames_file, memory_file
 from vla_eval.storage.folders import FRAMES, MEMORIES
+from vla_eval.task_state import PrivilegedState
 
 FRAME_PX, LARGER_FRAME_PX = 16, 32
 """Height and width of frames beside a memory, and alone: colours and places survive, texture does not."""
 MAX_BYTES = 2**30  # of a file when it is unpacked: more than a thousand inferences of any memory of ours
-MEMORY, FRAME, STEPS, IN_CUE = "memory/", "frame/", "steps", "in_cue"
+MEMORY, FRAME, STEPS, IN_CUE, SHOWN = "memory/", "frame/", "steps", "in_cue", "shown"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +41,8 @@ class EpisodeMemory:
     memory: Mapping[str, NDArray[Any]]
     frames: Mapping[str, NDArray[np.uint8]]  # camera -> (T, px, px, 3) the newest frame at each inference
     in_cue: NDArray[np.bool_] | None = None  # (T,) whether the cue is shown, where frames alone are kept
+    # (T, N) which candidates' cues are in view, by the simulator; None where the true state was not kept
+    shown: NDArray[np.bool_] | None = None
 
     @classmethod
     def read(cls, path: Path) -> "EpisodeMemory":
@@ -59,6 +62,9 @@ class EpisodeMemory:
         in_cue = arrays.pop(IN_CUE, None)
         if in_cue is not None and (in_cue.shape != steps.shape or in_cue.dtype != np.bool_):
             raise _refused(path, f"'{IN_CUE}': expected {len(steps)} truth values")
+        shown = arrays.pop(SHOWN, None)
+        if shown is not None and (shown.ndim != 2 or len(shown) != len(steps) or shown.dtype != np.bool_):
+            raise _refused(path, f"'{SHOWN}': expected truth values in {len(steps)} rows")
         for name, array in arrays.items():
             if not name.startswith((MEMORY, FRAME)) or array.shape[:1] != steps.shape:
                 raise _refused(path, f"'{name}' {array.shape}: expected an array with {len(steps)} rows")
@@ -67,6 +73,7 @@ class EpisodeMemory:
         return cls(
             steps=steps,
             in_cue=in_cue,
+            shown=shown,
             memory={n.removeprefix(MEMORY): a for n, a in arrays.items() if n.startswith(MEMORY)},
             frames={n.removeprefix(FRAME): a for n, a in arrays.items() if n.startswith(FRAME)},
         )
@@ -78,6 +85,7 @@ class _Log:
     memories: list[Mapping[str, NDArray[Any]]] = field(default_factory=list)
     frames: list[Mapping[str, ImageArray]] = field(default_factory=list)
     in_cue: list[bool] = field(default_factory=list)
+    shown: list[NDArray[np.bool_]] = field(default_factory=list)
 
 
 class MemoryLog(StepObserver):
@@ -141,6 +149,9 @@ class FrameLog(StepObserver):
         log.steps.append(seen.step)
         log.in_cue.append(result.status.phase == "cue")
         log.frames.append({camera: small(image, LARGER_FRAME_PX) for camera, image in seen.images.items()})
+        if isinstance(seen.privileged, PrivilegedState):
+            candidates = np.arange(len(seen.privileged.candidate_positions_m))
+            log.shown.append(np.isin(candidates, seen.privileged.shown_candidates))
         if result.status.phase == "response":
             self._waiting.discard(slot)
 
@@ -156,6 +167,7 @@ def _write(log: _Log, path: Path) -> None:
         **{f"{MEMORY}{name}": array for name, array in _stacked(log.memories).items()},
         **{f"{FRAME}{name}": array for name, array in _stacked(log.frames).items()},
         **({IN_CUE: np.array(log.in_cue)} if log.in_cue else {}),
+        **({SHOWN: np.array(log.shown)} if log.shown else {}),
     }
     partial = path.with_suffix(".tmp.npz")
     np.savez_compressed(partial, allow_pickle=False, **{STEPS: np.array(log.steps), **arrays})
