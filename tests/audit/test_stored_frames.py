@@ -1,16 +1,20 @@
 """How much has to be stored: verdicts from made-up answers, and the audit on the fake simulator."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from vla_eval.audit.stored_frames import ONE, SEVERAL, UNREAD, _best, _row, verdict
+from vla_eval.audit.frame_probes import best_option
+from vla_eval.audit.readings import READINGS, colours, pixels, places
+from vla_eval.audit.stored_frames import _row, fewest_frames, verdict
 from vla_eval.cli.main import main
 from vla_eval.evaluation.memory_log import EpisodeMemory
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.shipped_audit import ONE, SEVERAL, UNREAD
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -41,11 +45,80 @@ def test_the_best_step_is_chosen_without_the_episodes_that_it_is_judged_on() -> 
     by_step = np.zeros((3, 10), dtype=bool)
     by_step[1] = True
     by_step[2, folds == 0] = True  # right in one fold alone: never the best of the others
-    found, step = _best(by_step, folds)
+    found, step = best_option(by_step, folds)
     assert found.all() and step == 1
     lucky = np.zeros((2, 10), dtype=bool)
     lucky[0, 0], lucky[1, 1] = True, True
-    assert _best(lucky, folds)[0].sum() <= 1
+    assert best_option(lucky, folds)[0].sum() <= 1
+
+
+def remembered(*right: int) -> EpisodeRecord:
+    """A record of an episode in which these are right, in this order."""
+    return EpisodeRecord(
+        task="ChainOfColors3-v0",
+        policy="oracle",
+        n_action_steps=1,
+        run=0,
+        seed=1,
+        outcome="success",
+        right_candidates=right,
+        n_candidates=5,
+    )
+
+
+def shown(*steps: tuple[int, ...]) -> np.ndarray[Any, np.dtype[np.bool_]]:
+    return np.array([[candidate in step for candidate in range(5)] for step in steps])
+
+
+@pytest.mark.parametrize(
+    ("steps", "right", "expected"),
+    [
+        ([(1,), (1,), ()], (1,), 1),
+        ([(), (0, 2, 4), ()], (4, 0, 2), 1),  # all at once
+        ([(0,), (2,), (4,), ()], (4, 0, 2), 3),  # in turn
+        ([(0, 2), (2, 4), ()], (4, 0, 2), 2),  # the fewest that cover it
+        ([(0,), (2,), (0, 2)], (0, 2), 1),
+        ([(0,), (2,)], (0, 2, 4), None),  # one is never shown
+        ([(), ()], (1,), None),
+        ([(1,)], (), None),  # nothing is asked
+    ],
+)
+def test_the_fewest_frames_that_show_all_that_is_right(
+    steps: list[tuple[int, ...]], right: tuple[int, ...], expected: int | None
+) -> None:
+    assert fewest_frames(shown(*steps), remembered(*right)) == expected
+
+
+def test_without_the_true_state_it_is_not_known() -> None:
+    assert fewest_frames(None, remembered(1)) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_colours_do_not_depend_on_the_place_and_places_do(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    frames = np.full((6, 2, 32, 32, 3), 90, np.uint8)  # a grey table: the background
+    colour = rng.integers(0, 256, 3)
+    for episode, (row, column) in enumerate(rng.integers(0, 7, (5, 2)) * 4):
+        frames[episode, 0, row : row + 4, column : column + 4] = colour
+    found = {name: read(frames) for name, read in READINGS.items()}
+    assert found["colours"].shape == (6, 2, 125) and found["places"].shape == (6, 2, 9 * 64)
+    if np.abs(colour.astype(int) - 90).sum() > 40:
+        # 16 pixels of one colour, in one block: the root is 4 wherever they are.
+        assert (found["colours"][:5, 0].max(axis=1) == 4).all()
+        assert (found["places"][:5, 0].max(axis=1) == 4).all()
+        assert (found["colours"][:5, 0] == found["colours"][0, 0]).all()
+    assert not found["colours"][:, 1].any() and not found["places"][5].any()  # nothing there but the table
+    assert (pixels(frames)[..., :3] == frames[:, :, 0, 0]).all()
+
+
+def test_each_hue_and_each_grey_has_a_bin_of_its_own() -> None:
+    named = [(255, 0, 0), (255, 255, 0), (0, 255, 0), (0, 255, 255), (0, 0, 255), (255, 0, 255)]
+    named += [(10, 10, 10), (120, 120, 120), (250, 250, 250)]
+    frames = np.full((19, 1, 8, 8, 3), 200, np.uint8)
+    for episode, rgb in enumerate(named):
+        frames[episode, 0, 0, 0] = rgb
+    assert sorted(places(frames)[:9, 0].argmax(axis=1) // 64) == list(range(9))
+    assert len(set(colours(frames)[:9, 0].argmax(axis=1))) == 9
 
 
 def audit(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> list[dict[str, Any]]:
@@ -56,26 +129,18 @@ def audit(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> 
     return found
 
 
-def episode(seed: int, shown: tuple[int, ...]) -> tuple[EpisodeRecord, EpisodeMemory]:
+def episode(seed: int, items: tuple[int, ...]) -> tuple[EpisodeRecord, EpisodeMemory]:
     """An episode in which each item fills the image in turn, two steps long, and nothing is seen after."""
     rng = np.random.default_rng(seed)
-    levels = [40 * (item + 1) for item in shown for _ in range(2)] + [0, 0]
+    levels = [40 * (item + 1) for item in items for _ in range(2)] + [0, 0]
     frames = np.array([np.full((4, 4, 3), level) for level in levels]) + rng.integers(0, 4, (8, 4, 4, 3))
-    record = EpisodeRecord(
-        task="ChainOfColors3-v0",
-        policy="oracle",
-        n_action_steps=1,
-        run=0,
-        seed=seed,
-        outcome="success",
-        right_candidates=shown,
-        n_candidates=5,
-    )
+    record = replace(remembered(*items), seed=seed)
     memory = EpisodeMemory(
         steps=np.arange(8),
         memory={},
         frames={"base_camera": frames.astype(np.uint8)},
         in_cue=np.arange(8) < 6,
+        shown=shown(*(() if step > 5 else (items[step // 2],) for step in range(8))),
     )
     return record, memory
 
@@ -83,24 +148,27 @@ def episode(seed: int, shown: tuple[int, ...]) -> tuple[EpisodeRecord, EpisodeMe
 def test_items_shown_one_by_one_take_several_frames() -> None:
     rng = np.random.default_rng(0)
     # Two values for each of three places, so that one frame tells one of three.
-    shown = [tuple(int(one) for one in (rng.integers(2), 2 + rng.integers(2), 4)) for _ in range(60)]
-    row = _row("ChainOfColors3-v0", "order", [episode(seed, one) for seed, one in enumerate(shown)])
-    assert row.all.n == 60
-    assert row.verdict == SEVERAL
+    drawn = [tuple(int(one) for one in (rng.integers(2), 2 + rng.integers(2), 4)) for _ in range(60)]
+    row = _row("ChainOfColors3-v0", "order", [episode(seed, one) for seed, one in enumerate(drawn)])
+    assert row.all == 60
+    assert (row.probes, row.n_frames, row.verdict) == (SEVERAL, 3, SEVERAL)
     # One frame tells one of the two that vary, and the other is guessed: about half.
-    assert 15 <= row.best.n <= 45
-    assert row.newest.n < 30
+    assert 15 <= row.best <= 45
+    assert row.newest < 30
     one = [(n, 2, 4) for n in (0, 1) for _ in range(30)]
     row = _row("ChainOfColors3-v0", "set", [episode(seed, each) for seed, each in enumerate(one)])
-    assert (row.first.n, row.all.n, row.verdict) == (60, 60, ONE)
-    assert row.cue_end.n < 60  # the last frame of the cue shows the last item, which is always the same
+    # Two of the three are the same in all episodes: probes need not see them, an arm must.
+    assert (row.first, row.all, row.probes) == (60, 60, ONE)
+    assert (row.n_frames, row.verdict) == (3, SEVERAL)
+    assert row.cue_end < 60  # the last frame of the cue shows the last item, which is always the same
 
 
 def test_one_frame_is_enough_for_an_item(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (item,) = rows = audit(tmp_path, capsys, "--task", "RememberColor3-v0")
     assert (item["task"], item["asked"]) == ("RememberColor3-v0", "item")
     # 13 of 40 by chance; 24 and more with a probability below 0.0005. The rest of an image is noise there.
-    assert min(item["first"]["n"], item["cue_end"]["n"]) >= 24 > item["newest"]["n"]
+    assert min(item["first"], item["cue_end"]) >= 24 > item["newest"]
+    assert (item["n_frames"], item["verdict"]) == (1, ONE)
     assert audit(tmp_path, capsys, "--task", "RememberColor3-v0") == rows
     command = ["audit", "--stored-frames", "--episodes", "40", "--workers", "1", "--out", str(tmp_path)]
     assert main([*command, "--task", "RememberColor3-v0", "--set", "simulator=fake"]) == 0

@@ -11,6 +11,7 @@ import pytest
 from tests.probe.test_changed_memory import TASK, probe, remembers, row
 from vla_eval.cli.main import main
 from vla_eval.errors import RunFolderError
+from vla_eval.evaluation import memory_log
 from vla_eval.evaluation.memory_log import EpisodeMemory, small
 from vla_eval.probe.decoding import _labels
 from vla_eval.records import EpisodeRecord
@@ -100,12 +101,16 @@ def test_a_file_that_is_another_one_is_refused_and_no_pickle_is_loaded(
         EpisodeMemory.read(path)
 
 
-def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
+def test_a_small_file_that_unpacks_to_very_much_is_refused_before_it_is_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert memory_log.MAX_BYTES == 2**30
+    monkeypatch.setattr(memory_log, "MAX_BYTES", 2**24)
     path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive, archive.open("steps.npy", "w") as file:
-        for _ in range(1025):
+        for _ in range(17):
             file.write(bytes(2**20))
-    with pytest.raises(RunFolderError, match="expected at most 1073741824 bytes when unpacked"):
+    with pytest.raises(RunFolderError, match="expected at most 16777216 bytes when unpacked"):
         EpisodeMemory.read(path)
 
 

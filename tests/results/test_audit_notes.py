@@ -7,19 +7,25 @@ import pytest
 
 from tests.results.stored_runs import episodes, stored
 from vla_eval.audit.audit_text import render_audit
+from vla_eval.audit.stored_frames import render_stored_frames
 from vla_eval.audit.verdicts import verdict
 from vla_eval.errors import ReportError
 from vla_eval.results import shipped_audit as audited
 from vla_eval.results.report import audit_notes
 from vla_eval.results.shipped_audit import (
     NOT_AUDITED,
+    ONE,
     OTHER_VERDICTS,
     ROADS,
+    SEVERAL,
     STRICT,
+    UNREAD,
     Counts,
+    StoredFrames,
     TaskAudit,
     protocol_of,
     shipped_audits,
+    stored_frames,
 )
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import SUITES, TASKS, task_spec
@@ -58,9 +64,35 @@ def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         audit(TIMED, NOT_AUDITED, protocol="official"),
     ]
     audited.OFFICIAL_FILE.write_text(render_audit(official, "json"), encoding="utf-8")
-    shipped_audits.cache_clear()
+    monkeypatch.setattr(audited, "STORED_FRAMES_FILE", tmp_path / "stored_frames.json")
+    audited.STORED_FRAMES_FILE.write_text("[]", encoding="utf-8")
+    _read_again()
     yield
+    _read_again()
+
+
+def _read_again() -> None:
     shipped_audits.cache_clear()
+    stored_frames.cache_clear()
+
+
+def frames(task: str, verdict: str, *, version: int = 1, asked: audited.Asked = "item") -> StoredFrames:
+    return StoredFrames(
+        task=task,
+        version=version,
+        asked=asked,
+        n_episodes=80,
+        chance=0.3,
+        newest=24,
+        first=80,
+        cue_end=80,
+        best=80,
+        best_step=0,
+        all=80,
+        n_frames=1,
+        probes=verdict,
+        verdict=verdict,
+    )
 
 
 def run_of(task: str, **config: object) -> StoredRun:
@@ -73,6 +105,23 @@ def test_a_run_by_the_papers_rule_is_told_by_which_roads_its_task_can_be_won() -
         f"can be won without memory: {COLOR} by touching one candidate after another, or by storing the cue "
         "in the gripper (audit under the paper's rule, 30 episodes per control: docs/audit.md)."
     )
+
+
+def test_a_note_says_of_which_tasks_one_frame_has_to_be_stored_and_of_which_several() -> None:
+    seq, chain = "SeqOfColors3-v0", "ChainOfColors3-v0"
+    shipped = [audit(task, "needs memory") for task in (COLOR, seq, chain)] + [audit(SHELL, "can be toured")]
+    audited.FILE.write_text(render_audit(shipped, "json"), encoding="utf-8")
+    rows = [
+        frames(COLOR, ONE),
+        frames(SHELL, UNREAD),
+        frames(seq, SEVERAL, asked="set"),
+        frames(seq, SEVERAL, asked="order"),
+        frames(chain, SEVERAL, version=9),  # another task than the audited one
+    ]
+    audited.STORED_FRAMES_FILE.write_text(render_stored_frames(rows, "json"), encoding="utf-8")
+    _read_again()
+    (note,) = audit_notes([run_of(task) for task in (COLOR, SHELL, seq, chain)])
+    assert f"; one stored frame is enough: {COLOR}; several stored frames: {seq} (audit" in note
 
 
 def test_every_verdict_of_an_audit_has_words_for_readers() -> None:

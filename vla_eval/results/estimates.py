@@ -8,14 +8,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import scipy
 
 CONFIDENCE = 0.95
 LEVEL = 0.05  # of tests
-
-T = TypeVar("T")
 
 
 class Interval(NamedTuple):
@@ -82,7 +80,7 @@ class Share(NamedTuple):
     of: int
 
     @classmethod
-    def counted(cls, items: Sequence[T], holds: Callable[[T], bool]) -> "Share | None":
+    def counted[T](cls, items: Sequence[T], holds: Callable[[T], bool]) -> "Share | None":
         """Return the share of items for which something holds; None without an item."""
         return cls(sum(map(holds, items)), len(items)) if items else None
 

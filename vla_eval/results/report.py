@@ -21,10 +21,12 @@ from vla_eval.results.shipped_audit import (
     OTHER_VERDICTS,
     PROTOCOLS,
     ROADS,
+    UNREAD,
     AuditProtocol,
     TaskAudit,
     protocol_of,
     shipped_audits,
+    stored_frames,
 )
 from vla_eval.results.statistics import make_row, row_notes
 from vla_eval.results.success_table import Row, Table
@@ -119,7 +121,18 @@ def _note(protocol: AuditProtocol, audits: Mapping[str, TaskAudit]) -> str:
     for words, meaning in OTHER_VERDICTS.items():
         tasks = [task for task, audit in audits.items() if words in audit.verdict]
         said += [f"{meaning}: {', '.join(tasks)}"] if tasks else []
+    said += _stored(audits)
     n_episodes = min((audit.n_episodes for audit in audits.values() if audit.n_episodes), default=0)
     rules = PROTOCOLS[protocol]
     under = f"audit under {rules.words}, {n_episodes} episodes per control: {rules.page}"
     return f"{'; '.join(said)} ({under})."
+
+
+def _stored(audits: Mapping[str, TaskAudit]) -> list[str]:
+    """Say of which tasks one frame has to be stored, and of which several."""
+    found: dict[str, list[str]] = {}
+    for task, audit in audits.items():
+        frames = stored_frames().get(task)
+        if frames is not None and frames.version == audit.version and frames.verdict != UNREAD:
+            found.setdefault(frames.verdict, []).append(task)
+    return [f"{verdict}: {', '.join(tasks)}" for verdict, tasks in sorted(found.items())]

@@ -2,6 +2,7 @@
 
     mikasa-vla audit --format json > vla_eval/results/shipped_audit.json
     mikasa-vla audit --suite mikasa_vla_90 --format json > vla_eval/results/official_audit.json
+    mikasa-vla audit --stored-frames --format json > vla_eval/results/stored_frames.json
 
 Imports neither statistics nor simulators, so that a report can quote it.
 """
@@ -56,8 +57,14 @@ OTHER_VERDICTS: Mapping[str, str] = {
 }
 """A verdict without a shortcut -> its words in a note."""
 
+ONE, SEVERAL = "one stored frame is enough", "several stored frames"
+UNREAD = "not read by linear probes"
+Asked = Literal["item", "set", "order"]
+"""Of `StoredFrames`: the item; the set of items; the items in the order shown."""
+
 FILE = Path(__file__).with_suffix(".json")
 OFFICIAL_FILE = FILE.with_name("official_audit.json")
+STORED_FRAMES_FILE = FILE.with_name("stored_frames.json")
 OFFICIAL_ARGUMENTS = {"mug"}  # that change nothing of what is audited
 
 
@@ -94,19 +101,56 @@ class TaskAudit:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class StoredFrames:
+    """How much of one task has to be stored; the counts are episodes in which linear probes are right."""
+
+    task: str
+    version: Positive
+    asked: Asked
+    n_episodes: Positive
+    chance: Rate  # of the most frequent answer
+    newest: Count  # from the newest frame alone, the first of the response
+    first: Count  # from the first frame and the newest
+    cue_end: Count  # from the last frame of the cue and the newest
+    best: Count  # from the newest and the best other one, which the other folds choose
+    best_step: Count  # the one that most folds choose
+    all: Count  # from all frames
+    n_frames: Count | None  # the fewest that show it, in the episode that takes most; None if not known
+    probes: str  # the verdict of the probes alone
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Shipped:
     """So that a message says `audits.0.task`."""
 
     audits: tuple[TaskAudit, ...]
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _ShippedFrames:
+    """So that a message says `audits.0.task`."""
+
+    audits: tuple[StoredFrames, ...]
+
+
 @functools.cache
 def shipped_audits() -> Mapping[tuple[str, AuditProtocol], TaskAudit]:
     """Return (task, protocol) -> the shipped audit of it, or raise `ReportError` if a file is damaged."""
-    return {(one.task, one.protocol): one for file in (FILE, OFFICIAL_FILE) for one in _read(file)}
+    audits = [one for file in (FILE, OFFICIAL_FILE) for one in _read(file, _Shipped).audits]
+    return {(one.task, one.protocol): one for one in audits}
 
 
-def _read(file: Path) -> tuple[TaskAudit, ...]:
+@functools.cache
+def stored_frames() -> Mapping[str, StoredFrames]:
+    """Return task -> how much of it has to be stored, or raise `ReportError` if the file is damaged.
+
+    Where several things are asked of a task, the last one: the set before the order, which decides the same.
+    """
+    return {one.task: one for one in _read(STORED_FRAMES_FILE, _ShippedFrames).audits}
+
+
+def _read[T](file: Path, kind: type[T]) -> T:
     source = Source(
         where=str(file),
         what="the shipped audit",
@@ -117,7 +161,7 @@ def _read(file: Path) -> tuple[TaskAudit, ...]:
         rows = loads(read_file(file, source))
     except ValueError as exc:
         raise source.refuse("something else", shorten(str(exc))) from exc
-    return as_dataclass(_Shipped, {"audits": rows}, source).audits
+    return as_dataclass(kind, {"audits": rows}, source)
 
 
 def protocol_of(env: Mapping[str, Any], *, is_official: bool = False) -> AuditProtocol | None:
