@@ -44,6 +44,7 @@ COMMANDS = {
     "merge": "merge {W}/part-shard-1-of-2 {W}/part-shard-2-of-2 --out {W}/merged",
     "report": "report {W}/run --html {W}/page",
     "compare": "compare {W}/run",
+    "reproduce": f"reproduce 100/100 --task {TASK} --policy oracle --loss 0.3 {FAKE} --out {{W}}/reproduced",
     "check": "check oracle",
     "audit": f"audit --task {TASK} --control hold --protocol paper --episodes 2 {FAKE} --out {{W}}/audit",
     "probe": f"probe --task {TASK} --policy cue_blind --episodes 2 {FAKE} --out {{W}}/probe",

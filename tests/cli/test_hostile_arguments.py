@@ -28,6 +28,7 @@ NEEDED: dict[tuple[str, ...], str] = {
     ("report",): "nothing",
     ("merge",): "nothing --out new",
     ("compare",): "nothing",
+    ("reproduce",): f"100/100 --task {TASK} --policy oracle --set simulator=fake",
     ("check",): "oracle",
     ("audit",): f"--task {TASK} --set simulator=fake",
     ("probe",): f"--task {TASK} --policy oracle --set simulator=fake",

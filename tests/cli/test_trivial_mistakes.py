@@ -43,6 +43,12 @@ MISTAKES: dict[str, dict[str, str]] = {
     "report": {"report runs/nowhere": "runs/nowhere", "report empty": "empty"},
     "merge": {"merge runs/nowhere --out new": "runs/nowhere"},
     "compare": {"compare runs/nowhere": "runs/nowhere"},
+    "reproduce": {
+        "reproduce runs/nowhere --policy oracle": "runs/nowhere",
+        f"reproduce 9/10 --policy oracle --task RememberColour3-v0 {FAKE}": "RememberColour3-v0",
+        "reproduce 100/100 --policy oracle": "of which task",
+        f"reproduce 100/100 --policy orcale --task {TASK} {FAKE}": "Did you mean 'oracle'",
+    },
     "check": {
         "check orcale": "Did you mean 'oracle'",
         "check runs/nowhere": "runs/nowhere",

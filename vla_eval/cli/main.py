@@ -24,6 +24,7 @@ VERBS: Mapping[str, str] = {
     "report": "print the success table of run folders",
     "merge": "put the shards of a run together",
     "compare": "compare chunk lengths or policies with a reference",
+    "reproduce": "find out whether a policy is as good as was claimed",
     "check": "check whether a policy, or a policy server, keeps its contract",
     "audit": "find the tasks that can be won without memory",
     "probe": "find out what a policy remembers, and for how long",

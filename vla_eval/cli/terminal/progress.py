@@ -100,10 +100,17 @@ def evaluate_with_progress(
     stop: StopRequest,
     allow_environment_change: bool,
     json_progress: int | None,
+    is_enough: Callable[[EpisodeRecord | None], bool] = lambda _: False,
 ) -> EvaluationSummary:
-    """Run an evaluation with progress on standard error, and end early if asked to stop."""
+    """Run an evaluation with progress on standard error.
+
+    It ends early if asked to stop, or once `is_enough` says so: of a record that has come, or, before the
+    first one, of those that were there (None).
+    """
     capture = resolved.config.capture
-    progress = Progress(stop, out=resolved.out, capture=capture, json_progress=json_progress)
+    progress = Progress(
+        stop, out=resolved.out, capture=capture, json_progress=json_progress, is_enough=is_enough
+    )
     try:
         return evaluate(
             resolved, command=command, allow_environment_change=allow_environment_change, observer=progress
@@ -171,10 +178,18 @@ class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
     """Shows an evaluation on standard error."""
 
     def __init__(
-        self, stop: StopRequest, *, out: Path, capture: CaptureConfig, json_progress: int | None = None
+        self,
+        stop: StopRequest,
+        *,
+        out: Path,
+        capture: CaptureConfig,
+        json_progress: int | None = None,
+        is_enough: Callable[[EpisodeRecord | None], bool] = lambda _: False,
     ) -> None:
         lines = JsonLines(json_progress)
         super().__init__(stop, EvaluationLines(lines, out=out), is_quiet=lines.is_stderr)
+        self._is_enough = is_enough
+        self._has_enough = False
         self._capture = capture
         self._out = out
         self._n_total = self._n_done = self._n_errors = 0
@@ -182,6 +197,7 @@ class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
 
     def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:
         """Say how much there is to do, and what is left out."""
+        self._has_enough = self._is_enough(None)
         self._lines.on_start(plan, n_finished=n_finished, n_workers=n_workers)
         n_episodes = len(plan.jobs)
         for pair in plan.left_out:
@@ -217,6 +233,7 @@ class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
 
     def on_record(self, record: EpisodeRecord) -> None:
         """Count the record; say at once what went wrong."""
+        self._has_enough = self._has_enough or self._is_enough(record)
         self._lines.on_record(record)
         self._n_done += 1
         if record.error is not None:
@@ -227,6 +244,10 @@ class Progress(_BarAndLines[EvaluationLines], EvaluationObserver):
             self._successes.setdefault(record.policy, []).append(bool(record.success_once))
         note = f"{success_text(self._successes)}errors {self._n_errors}"
         self._bar.advance(n_done=self._n_done, n_steps=record.n_steps or 0, note=note)
+
+    def on_tick(self) -> bool:
+        """As for every bar; the run also stops once it has enough."""
+        return super().on_tick() or self._has_enough
 
     def on_load(self, load: Load) -> None:
         """Show steps as they are executed, and of a cluster its queue and its machines."""
