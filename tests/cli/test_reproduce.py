@@ -157,3 +157,15 @@ def test_a_claim_of_another_version_of_the_task_is_refused(
         (old / name).write_text(text.replace(f'"{COLOR}": 1', f'"{COLOR}": 7'), encoding="utf-8")
     assert reproduce(str(old), "--of", "oracle", "--n-action-steps", "4", "--policy", "oracle", *FAKE) == 1
     assert "version 7 of the task" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("settings", "code"), [((), 0), (("--set", "reset_policy_at_step=8"), 4)], ids=["as shipped", "forgets"]
+)
+def test_the_shipped_policy_is_accepted_and_its_twin_that_forgets_is_not(
+    settings: tuple[str, ...], code: int, tmp_path: Path
+) -> None:
+    claim = ("leaderboard_mikasa/memory", "--task", COLOR, "--policy", "memory_color3")
+    measured = ("--set", "render.wrist_mesh=simplified", "--out", str(tmp_path))
+    assert reproduce(*claim, *measured, *settings) == code

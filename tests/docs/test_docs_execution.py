@@ -54,6 +54,7 @@ NOT_EXECUTED: Mapping[str, str] = {
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
     r"audit --stored-frames.*": "twenty episodes at least; tests/audit/test_stored_frames.py",
+    r"reproduce .*": "up to hundreds of episodes; tests/cli/test_reproduce.py",
     r"serve --policy pi05 .*": "fetched weights and a GPU; tests/cli/test_serve.py",
 }
 """Command -> what it needs that is not here, and which tests run the like."""

@@ -25,7 +25,7 @@ NOT_OF_THE_CLAIM = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claimed:
-    """A claim, what it is of, and what else is known of how it was measured."""
+    """A claim, what it is of, and how it was measured, as far as that is known."""
 
     claim: Claim
     of: str  # in words
@@ -55,6 +55,7 @@ def read_claim(
     if match := COUNT.fullmatch(text):
         if task is None:
             raise RecipeError(f"{text}: of which task? Name it with --task.")
+        task_spec(task)  # whether there is one
         n_success, n_episodes = map(int, match.groups())
         claim = Claim(n_success=n_success, n_episodes=n_episodes)
         return Claimed(claim=claim, of="the claim", task=task, n_action_steps=n_action_steps)
