@@ -164,8 +164,10 @@ def render_stored_frames(rows: Sequence[StoredFrames], style: Literal["markdown"
     notes = [
         "Share of episodes in which linear probes are right in all that is asked; each episode is predicted "
         "by probes of other seeds. set: which items; order: in the order shown.",
-        f"{ONE}: all frames together are not better than the newest and one other (exact McNemar test, "
-        f"{ALPHA}); {UNREAD}: neither is right in {READ:.0%} of the episodes, and above chance.",
+        f"Probes: {ONE}: all frames together are not better than the newest and one other (exact McNemar "
+        f"test, {ALPHA}); {UNREAD}: neither is right in {READ:.0%} of the episodes, and above chance.",
+        "Frames that show it: the fewest that have all that is right in view, by the simulator. The verdict "
+        "is about them; where the probes find that one is not enough, it is not.",
     ]
     return write_tables([PrintedTable(columns=_COLUMNS, rows=cells_of(_COLUMNS, rows), notes=notes)], style)
 
