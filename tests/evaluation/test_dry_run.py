@@ -16,6 +16,7 @@ from vla_eval.config.evaluation import CaptureConfig, EvalConfig
 from vla_eval.errors import VlaEvalError
 from vla_eval.evaluation import evaluate as evaluating
 from vla_eval.evaluation.dry_run import AssumedRates
+from vla_eval.memory_change import MemoryChange
 from vla_eval.policies import entries
 
 
@@ -49,6 +50,28 @@ def test_a_policy_that_is_shown_every_frame_has_a_frame_of_each_step() -> None:
     effort = evaluation_effort(learned, out=Path("nowhere"))
     assert effort.n_inferences == 4 * 10 and effort.n_learned_inferences == 2 * 10
     assert effort.n_frames == 2 * 2 * 60  # cameras, episodes, steps; the oracle reads no image
+
+
+@pytest.mark.parametrize(
+    ("change", "donor_steps"),
+    [
+        ({"kind": "carry_over"}, 60),  # the whole episode of the seed before
+        ({"kind": "transplant", "at_step": 10, "donor_env": {"swap_cue": 1}}, 12),  # to the third inference
+        ({"kind": "transplant", "at_step": 12, "donor_env": {"swap_cue": 1}}, 12),
+        ({"kind": "hold_memory", "at_step": 10}, 0),
+    ],
+)
+def test_the_episodes_that_give_their_memory_are_counted(change: dict[str, Any], donor_steps: int) -> None:
+    changed = dataclasses.replace(
+        config(),
+        policies=("memory_color3",),
+        n_action_steps=(6,),
+        memory_change=MemoryChange(**change),
+    )
+    effort = evaluation_effort(changed, out=Path("nowhere"))
+    assert effort.n_steps == 2 * (60 + donor_steps)
+    assert effort.n_inferences == 2 * (60 + donor_steps) / 6
+    assert effort.n_frames == 2 * 2 * (60 + donor_steps)
 
 
 @pytest.mark.parametrize(

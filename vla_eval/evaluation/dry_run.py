@@ -75,19 +75,20 @@ def evaluation_effort(
     finished = frozenset(record.key for record in records if record.error is None)
     ahead = [job for job in plan.jobs if job.key not in finished]
     queue = JobQueue(plan.jobs, finished=finished)
-    steps = [job.group.offered.horizon_steps for job in ahead]
-    inferences = [math.ceil(n_steps / _interval(job)) for job, n_steps in zip(ahead, steps, strict=True)]
+    steps = [(job, (job.group.offered.horizon_steps, _donor_steps(job, config))) for job in ahead]
+    inferences = [(job, sum(math.ceil(n / _interval(job)) for n in both)) for job, both in steps]
     reads = images_read(resolved.policies)
     rendered = [
-        n_rendered(job, config, reads=reads[job.group.part], n_steps=n_steps)
-        for job, n_steps in zip(ahead, steps, strict=True)
+        n_rendered(job, config, reads=reads[job.group.part], n_steps=own)
+        + _shown(job, config, reads=reads[job.group.part], n_steps=donors)
+        for job, (own, donors) in steps
     ]
-    learned = [n for job, n in zip(ahead, inferences, strict=True) if LEARNED in job.group.args]
+    learned = [n for job, n in inferences if LEARNED in job.group.args]
     return EvaluationEffort(
         n_episodes=len(plan.jobs),
         n_finished=len(plan.jobs) - len(ahead),
-        n_steps=sum(steps),
-        n_inferences=sum(inferences),
+        n_steps=sum(sum(both) for _, both in steps),
+        n_inferences=sum(n for _, n in inferences),
         n_learned_inferences=sum(learned),
         n_frames=N_CAMERAS * sum(rendered),
         n_workers=worker_count(resolved, plan, n_jobs=queue.n_batches),
@@ -153,17 +154,32 @@ def images_read(policies: Sequence[PolicyEntry]) -> dict[str, Reads]:
 
 def n_rendered(job: EpisodeJob, config: EvalConfig, *, reads: Reads, n_steps: int) -> int:
     """Return at how many control steps of an episode of `n_steps` images are rendered at most."""
-    for_policy = 0
-    if reads == "every" or (reads == "last" and config.eager_rendering):
-        for_policy = n_steps
-    elif reads == "last":
-        kept = config.cue_view == "first_frame"  # the cue's first frame, which is shown again
-        for_policy = min(n_steps, math.ceil(n_steps / _interval(job)) + kept)
+    for_policy = _shown(job, config, reads=reads, n_steps=n_steps)
     capture = config.capture
     index = job.seed - config.seed_start
     if not any(may_be_wanted(which, run=job.run, index=index) for which in (capture.video, capture.rrd)):
         return for_policy
     return min(n_steps + 1, for_policy + math.ceil((n_steps + 1) / capture.frame_stride))
+
+
+def _shown(job: EpisodeJob, config: EvalConfig, *, reads: Reads, n_steps: int) -> int:
+    """Return at how many control steps images are rendered for the policy."""
+    if reads == "every" or (reads == "last" and config.eager_rendering):
+        return n_steps
+    if reads != "last":
+        return 0
+    kept = config.cue_view == "first_frame"  # the cue's first frame, which is shown again
+    return min(n_steps, math.ceil(n_steps / _interval(job)) + kept)
+
+
+def _donor_steps(job: EpisodeJob, config: EvalConfig) -> int:
+    """Return the control steps of the episode whose memory is put in: none, all, or up to the change."""
+    change = config.memory_change
+    if change is None or not change.has_donor:
+        return 0
+    if change.kind == "carry_over":
+        return job.group.offered.horizon_steps
+    return math.ceil(change.at_step / _interval(job)) * _interval(job)
 
 
 def _interval(job: EpisodeJob) -> int:
