@@ -15,6 +15,7 @@ from vla_eval.core import EpisodeStart, ObservationWindow
 from vla_eval.envs.maniskill import ManiSkillEnv
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_oracle
+from vla_eval.tasks.catalog import task_spec
 
 CAMERAS = ("base_camera", "hand_camera")
 # Steps of the phases: the cue, the delay, the reveal, the oracle on its way, and at its goal.
@@ -24,6 +25,7 @@ STEPS = {
     "RememberColor9-v0": (0, 5, 10, 16, 22),
     "RememberShape9-v0": (0, 5, 10, 16, 22),
     "RememberShapeAndColor3x3-v0": (0, 5, 10, 16, 22),
+    "RememberObject9-v0": (0, 5, 10, 16, 22),
     "ShellGameTouch-v0": (0, 4, 5, 10, 16),
     "ShellGamePush-v0": (0, 4, 5, 14, 22),
     "ShellGamePick-v0": (0, 4, 5, 26, 38),
@@ -44,7 +46,9 @@ def picture(task: str) -> np.ndarray:
     env = ManiSkillEnv(EnvSettings(task=task, cameras=CAMERAS, privileged=True))
     chunking = ChunkingSpec(n_action_steps=1)
     policy = make_oracle(
-        PolicyContext(name="oracle", env=env.spec, chunking=chunking, n_candidates=env.n_candidates)
+        PolicyContext(
+            name="oracle", env=env.spec, chunking=chunking, n_candidates=task_spec(task).n_candidates({})
+        )
     )
     policy.reset(
         [

@@ -15,9 +15,10 @@ from vla_eval.tasks.arguments import check_arguments, offered_by, robot_uid
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import Suite
 
-OFFICIAL = "vla_eval.envs.official:OfficialEnv"
+OWN, OFFICIAL = "vla_eval.envs.maniskill:ManiSkillEnv", "vla_eval.envs.official:OfficialEnv"
 ENVIRONMENTS: Mapping[Suite, str] = {
-    "paper": "vla_eval.envs.maniskill:ManiSkillEnv",
+    "paper": OWN,
+    "objects": OWN,
     "mikasa_vla_90": OFFICIAL,
     "mikasa_official": OFFICIAL,
     "mikasa_base": "vla_eval.envs.mikasa_base:BaseTaskSim",

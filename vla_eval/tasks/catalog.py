@@ -32,7 +32,9 @@ VERSION = re.compile(r"(-VLA)?-v\d+", re.ASCII)
 N_MUGS = 3
 
 
-def _remember(family: str, number: str, kwargs: dict[str, int], what: str) -> TaskSpec:
+def _remember(
+    family: str, number: str, kwargs: dict[str, int], what: str, *, suite: Suite = "paper"
+) -> TaskSpec:
     return TaskSpec(
         id=f"{family}{number}-v0",
         entry_point=f"vla_eval.tasks.remember:{family}Env",
@@ -48,6 +50,7 @@ def _remember(family: str, number: str, kwargs: dict[str, int], what: str) -> Ta
         candidate_counts=kwargs,
         chance_success=1 / math.prod(kwargs.values()),
         other_arms=(FETCH_UID,),
+        suite=suite,
     )
 
 
@@ -70,6 +73,16 @@ _REMEMBER = (
         )
         for shapes, colors in ((3, 2), (3, 3), (5, 3))
     ),
+)
+_OBJECTS = tuple(
+    _remember(
+        "RememberObject",
+        f"{n}",
+        {"n_items": n},
+        f"{n} everyday things lie there: reach the one that was shown.",
+        suite="objects",
+    )
+    for n in (3, 5, 9)
 )
 
 
@@ -116,7 +129,7 @@ _SHELL_GAME = (
 )
 
 TASKS: dict[str, TaskSpec] = {
-    spec.id: spec for spec in (*_REMEMBER, *SEQUENCE_TASKS, *_SHELL_GAME, *SPATIAL_TASKS)
+    spec.id: spec for spec in (*_REMEMBER, *SEQUENCE_TASKS, *_SHELL_GAME, *SPATIAL_TASKS, *_OBJECTS)
 }
 
 

@@ -24,6 +24,7 @@ FAMILY_TABLE = (
     Family("RememberColor", "RememberColor3-v0", ("n_items",), 50),
     Family("RememberShape", "RememberShape3-v0", ("n_items",), 50),
     Family("RememberShapeAndColor", "RememberShapeAndColor3x2-v0", ("n_shapes", "n_colors"), 50),
+    Family("RememberObject", "RememberObject3-v0", ("n_items",), 50),
     Family("BunchOfColors", "BunchOfColors3-v0", ("n_shown",), 110),
     Family("SeqOfColors", "SeqOfColors3-v0", ("n_shown",), 80),
     Family("ChainOfColors", "ChainOfColors3-v0", ("n_shown",), 80),

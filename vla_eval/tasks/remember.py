@@ -17,7 +17,15 @@ from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere
 from vla_eval.tasks.objects.item_names import MIXED_SHAPE_NAMES, N_MIXED_COLORS
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
 from vla_eval.tasks.objects.layout import Plane, jittered_apart, slot_centres_m
-from vla_eval.tasks.objects.limits import CubeHalfSize, ItemCount, MixedColorCount, MixedShapeCount, Positive
+from vla_eval.tasks.objects.limits import (
+    CubeHalfSize,
+    ItemCount,
+    MixedColorCount,
+    MixedShapeCount,
+    Positive,
+    ThingCount,
+)
+from vla_eval.tasks.objects.things import THINGS
 from vla_eval.tasks.tensors_out import Info
 
 SHAPE_COLOR = COLORS[2]  # blue, as in the official RememberShape
@@ -124,6 +132,27 @@ class RememberShapeEnv(RememberEnv):
         limits.check(ItemCount, n_items=n_items)
         shapes = list(SHAPES.values())[:n_items]
         super().__init__(*args, items=tuple(Item(shape, SHAPE_COLOR) for shape in shapes), **kwargs)
+
+
+class RememberObjectEnv(RememberEnv):
+    """RememberObject: find the everyday thing that was shown before; see `RememberEnv`.
+
+    Source: the paper, section "Extending atomic tasks with realistic object distributions", which replaces
+    the cubes of RememberColor by randomly sampled objects of YCB. Here they are twelve small things made of
+    primitives (`objects/things.py`), and a task with N has the first N of them.
+
+    Arguments: `n_items` 2 to 12, and those of `RememberEnv`, `ChoiceEnv` and `MemoryTableEnv`.
+    """
+
+    FAMILY = 12
+
+    def __init__(self, *args: Any, n_items: ThingCount = 3, **kwargs: Any) -> None:
+        limits.check(ThingCount, n_items=n_items)
+        items = tuple(Item(thing) for thing in list(THINGS.values())[:n_items])
+        super().__init__(*args, items=items, **kwargs)
+
+    def _places_m(self, rng: np.random.Generator) -> Plane:
+        return jittered_apart(slot_centres_m(self.n_items), rng)
 
 
 class RememberShapeAndColorEnv(RememberEnv):

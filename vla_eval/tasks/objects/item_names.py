@@ -20,7 +20,11 @@ SHAPE_NAMES = ("cube", "sphere", "cylinder", "cross", "torus", "star", "pyramid"
 # Shapes and colours, the first ones, of tasks whose items differ in both.
 MIXED_SHAPE_NAMES = ("cube", "sphere", "t_shape", "cross", "torus")
 N_MIXED_COLORS = 3
-_NAMES = {"RememberColor": COLOR_NAMES, "RememberShape": SHAPE_NAMES}
+THING_NAMES = (
+    *("banana", "mug", "hammer", "bottle", "apple", "bowl"),
+    *("book", "car", "mushroom", "carrot", "cone", "key"),
+)  # fmt: skip
+_NAMES = {"RememberColor": COLOR_NAMES, "RememberShape": SHAPE_NAMES, "RememberObject": THING_NAMES}
 
 
 def item_names(task: str, n_items: int) -> tuple[str, ...]:

@@ -41,6 +41,7 @@ class Primitive:
     size: tuple[float, ...]
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     orientation_wxyz: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
+    rgb: tuple[int, int, int] | None = None  # of this part, 0 to 255; None: the item's colour
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,15 +143,21 @@ SHAPES = {
 
 
 class Item(NamedTuple):
-    """A shape in a colour."""
+    """A shape in a colour, or in the colours of its parts."""
 
     shape: Shape
-    color: NamedColor
+    color: NamedColor | None = None
 
     @property
     def name(self) -> str:
-        """For example `red_cube`."""
-        return f"{self.color.name}_{self.shape.name}"
+        """For example `red_cube`, or `banana`."""
+        return f"{self.color.name}_{self.shape.name}" if self.color else self.shape.name
+
+    def rgb_of(self, part: Primitive) -> tuple[int, int, int]:
+        """Return the colour of a part, 0 to 255."""
+        rgb = part.rgb or (self.color.rgb if self.color else None)
+        assert rgb is not None, f"{self.name}: a part without a colour"
+        return rgb
 
 
 def build_item(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose) -> Actor:
@@ -170,9 +177,13 @@ def build_decoy(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose)
 
 def _item_builder(scene: ManiSkillScene, item: Item) -> Any:  # ManiSkill is untyped
     builder = scene.create_actor_builder()
-    rgba = [*(channel / 255 for channel in item.color.rgb), 1.0]
-    material = sapien.render.RenderMaterial(base_color=rgba) if scene.can_render() else None
+    materials = {}  # one for all parts of a colour
     for part in item.shape.parts:
+        rgb = item.rgb_of(part)
+        if rgb not in materials and scene.can_render():
+            rgba = [*(channel / 255 for channel in rgb), 1.0]
+            materials[rgb] = sapien.render.RenderMaterial(base_color=rgba)
+        material = materials.get(rgb)
         pose = sapien.Pose(list(part.position_m), list(part.orientation_wxyz))
         if part.kind == "box":
             builder.add_box_collision(pose, list(part.size))

@@ -11,7 +11,7 @@ from typing import Annotated, Any, NamedTuple, get_args
 from vla_eval.control_modes import EE_DELTA_POS, EE_DELTA_POSE
 from vla_eval.errors import TaskArgumentError
 from vla_eval.strict.bounds import MAX_IMAGE_SIZE_PX, MAX_STEPS, MIN_IMAGE_SIZE_PX
-from vla_eval.tasks.objects.item_names import COLOR_NAMES, MIXED_SHAPE_NAMES, N_MIXED_COLORS
+from vla_eval.tasks.objects.item_names import COLOR_NAMES, MIXED_SHAPE_NAMES, N_MIXED_COLORS, THING_NAMES
 from vla_eval.tasks.objects.layout import GOAL_X_M, START_BANDS_Y_M, START_X_M
 
 MAX_SPEED_M_S = 10.0  # of a ball; it crosses the table in a quarter of a second
@@ -43,6 +43,7 @@ class Limits(NamedTuple):
 Positive = Annotated[float, Limits(0, above=True)]
 NotNegative = Annotated[int, Limits(0)]
 ItemCount = Annotated[int, Limits(2, len(COLOR_NAMES))]  # one per colour, or per shape: there are as many
+ThingCount = Annotated[int, Limits(2, len(THING_NAMES))]
 ShownCount = Annotated[int, Limits(1, len(COLOR_NAMES))]
 MixedShapeCount = Annotated[int, Limits(1, len(MIXED_SHAPE_NAMES))]
 MixedColorCount = Annotated[int, Limits(1, N_MIXED_COLORS)]
