@@ -41,6 +41,7 @@ def test_an_original_official_task_has_the_sentence_and_the_horizon_of_ours() ->
 
 def test_ids_of_the_suites_are_not_mixed_up() -> None:
     assert not set(TASKS) & set(SUITES["mikasa_vla_90"])
-    assert set(SUITES["paper"]) == set(TASKS)
+    own = {*SUITES["paper"], *SUITES["objects"]}
+    assert own == set(TASKS) and len(SUITES["paper"]) == 32
     with pytest.raises(UnknownNameError, match="Did you mean 'mikasa_vla/RememberColor3-VLA-v0'"):
         task_spec("mikasa_vla/RememberColour3-VLA-v0")

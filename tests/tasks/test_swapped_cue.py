@@ -45,7 +45,9 @@ def held(task: str, n_after: int = 4, **kwargs: Any) -> tuple[list[np.ndarray], 
     return states, right, response_step
 
 
-@pytest.mark.parametrize("task", ["RememberShape9-v0", "BunchOfColors3-v0", "ShellGameTouch-v0"])
+@pytest.mark.parametrize(
+    "task", ["RememberShape9-v0", "RememberObject9-v0", "BunchOfColors3-v0", "ShellGameTouch-v0"]
+)
 def test_the_other_cue_moves_no_body_by_a_bit(task: str) -> None:
     """In the first two, an item that has been shown would settle in another way than one that has not."""
     drawn, right, response_step = held(task)

@@ -87,7 +87,11 @@ def test_gym_make_gives_the_task_with_horizon_instruction_and_info(sampled_task:
 
 
 @pytest.mark.parametrize(
-    "task", ["RememberColor3-v0", "RememberColor9-v0", "RememberShape9-v0", "RememberShapeAndColor5x3-v0"]
+    "task",
+    [
+        *("RememberColor3-v0", "RememberColor9-v0", "RememberShape9-v0", "RememberShapeAndColor5x3-v0"),
+        "RememberObject9-v0",
+    ],
 )
 def test_item_is_shown_hidden_and_then_all_items_lie_still_on_the_table(task: str) -> None:
     env = make(task)

@@ -141,7 +141,7 @@ _PARTS: dict[str, tuple[float, tuple[Primitive, ...]]] = {
         (
             Primitive(kind="sphere", size=(0.018,), rgb=APPLE),
             *_turned((0.0015, 0.008, BROWN), bottom_m=0.017),
-            _box(0.009, 0.005, 0.0015, LEAF, at=(0.004, 0.0, 0.021)),
+            _box(0.016, 0.005, 0.0015, LEAF, at=(0.0, 0.0, 0.021))  # a leaf on one side would tilt it,
         ),
     ),
     "bowl": (
