@@ -58,6 +58,8 @@ def _shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     ]
     monkeypatch.setattr(audited, "FILE", tmp_path / "shipped_audit.json")
     audited.FILE.write_text(render_audit(rows, "json"), encoding="utf-8")
+    monkeypatch.setattr(audited, "OBJECTS_FILE", tmp_path / "objects_audit.json")
+    audited.OBJECTS_FILE.write_text("[]", encoding="utf-8")
     monkeypatch.setattr(audited, "OFFICIAL_FILE", tmp_path / "official_audit.json")
     official = [
         audit(LONG, "won by staying at the cue", protocol="official"),

@@ -32,9 +32,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     which.add_argument("--task", **{**FLAGS["--task"], "help": "task ids (all of the suite)"})
     which.add_argument(
         "--suite",
-        choices=("paper", "mikasa_vla_90", "mikasa_base"),
+        choices=("paper", "objects", "mikasa_vla_90", "mikasa_base"),
         default="paper",
-        help="all tasks of this package (paper), the official package's 90, or MIKASA-Base",
+        help="the paper's 32 tasks (paper), those with everyday things, the official package's 90, or "
+        "MIKASA-Base",
     )
     parser.add_argument("--control", **MANY, dest="controls", metavar="C", help="only these controls")
     parser.add_argument(

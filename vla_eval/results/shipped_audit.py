@@ -1,6 +1,7 @@
 """The shortcut audits that ship, of this package's tasks and of the official ones, each made by a command.
 
     mikasa-vla audit --format json > vla_eval/results/shipped_audit.json
+    mikasa-vla audit --suite objects --format json > vla_eval/results/objects_audit.json
     mikasa-vla audit --suite mikasa_vla_90 --format json > vla_eval/results/official_audit.json
     mikasa-vla audit --stored-frames --format json > vla_eval/results/stored_frames.json
 
@@ -63,6 +64,7 @@ Asked = Literal["item", "set", "order"]
 """Of `StoredFrames`: the item; the set of items; the items in the order shown."""
 
 FILE = Path(__file__).with_suffix(".json")
+OBJECTS_FILE = FILE.with_name("objects_audit.json")
 OFFICIAL_FILE = FILE.with_name("official_audit.json")
 STORED_FRAMES_FILE = FILE.with_name("stored_frames.json")
 OFFICIAL_ARGUMENTS = {"mug"}  # that change nothing of what is audited
@@ -137,7 +139,7 @@ class _ShippedFrames:
 @functools.cache
 def shipped_audits() -> Mapping[tuple[str, AuditProtocol], TaskAudit]:
     """Return (task, protocol) -> the shipped audit of it, or raise `ReportError` if a file is damaged."""
-    audits = [one for file in (FILE, OFFICIAL_FILE) for one in _read(file, _Shipped).audits]
+    audits = [one for file in (FILE, OBJECTS_FILE, OFFICIAL_FILE) for one in _read(file, _Shipped).audits]
     return {(one.task, one.protocol): one for one in audits}
 
 
