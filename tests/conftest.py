@@ -6,6 +6,7 @@ import gc
 import os
 import shutil
 import socket
+from collections import Counter
 from collections.abc import Callable, Generator, Iterator
 from importlib import metadata
 from multiprocessing import forkserver
@@ -94,6 +95,20 @@ def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
     """Run a test that takes `sampled_task` on every task of the catalogue."""
     if "sampled_task" in metafunc.fixturenames:
         metafunc.parametrize("sampled_task", SAMPLED_TASKS)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark as slow all but every n-th case of a test that is `sampled(n)`, before markers are asked for."""
+    n_seen: Counter[str] = Counter()
+    for item in items:
+        marker = item.get_closest_marker("sampled")
+        if marker is None:
+            continue
+        name = item.nodeid.partition("[")[0]
+        if n_seen[name] % marker.args[0]:
+            item.add_marker(pytest.mark.slow)
+        n_seen[name] += 1
 
 
 def pytest_collection_finish() -> None:

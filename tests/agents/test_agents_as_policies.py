@@ -135,6 +135,7 @@ def _all(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join((said.out + said.err).split())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", [pytest.param(ROBOT, marks=pytest.mark.slow), BIT])
 def test_checkpoints_are_evaluated_on_held_out_seeds_and_change_nothing(task: str, tmp_path: Path) -> None:
     held_out = HeldOutConfig(every_steps=32, episodes=3, workers=1)

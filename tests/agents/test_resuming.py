@@ -41,6 +41,7 @@ def whole(
 
 
 # 24 steps of two environments: within the first, the second and the third part between checkpoints.
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("stops", [(3,), (11,), (9, 10), (23,)])
 def test_a_training_that_was_stopped_anywhere_has_the_weights_of_one_that_was_not(
     whole: tuple[str, dict[str, bytes]], stops: tuple[int, ...], tmp_path: Path

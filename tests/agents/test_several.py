@@ -93,6 +93,7 @@ def test_a_shard_of_one_training_is_refused(capsys: pytest.CaptureFixture[str]) 
     assert "--shard is for several trainings" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_file_of_several_is_each_recipe_task_and_run_seed_and_flags_choose_among_them(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

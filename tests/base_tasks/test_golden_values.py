@@ -50,6 +50,7 @@ def test_every_id_of_the_golden_values_is_in_the_catalogue_under_its_name() -> N
     assert set(golden_ids()) == set(BASE_TASKS)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", COMPARED)
 def test_episodes_of_the_original_repeat_bit_for_bit(name: str) -> None:
     row = BASE_TASKS[name]

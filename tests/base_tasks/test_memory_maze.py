@@ -117,6 +117,7 @@ print(digest.hexdigest())
 """
 
 
+@pytest.mark.slow
 def test_two_processes_give_the_same_episode_and_print_nothing() -> None:
     env = make_base_task(SMALL)
     observation, _ = env.reset(seed=5)

@@ -58,6 +58,7 @@ def test_standard_output_that_cannot_be_written_is_one_message_and_costs_no_resu
     assert len(read_run(tmp_path / "out").records) == 2
 
 
+@pytest.mark.slow
 def test_a_folder_s_name_need_be_no_text_and_the_locale_may_be_ascii(tmp_path: Path) -> None:
     out = b"r\xffsults-\xc3\xa9"
     for arguments in ([*EVAL, b"--out", out], ["report", out, "--format", "markdown"]):

@@ -104,6 +104,7 @@ def outcome(case: Case, capsys: pytest.CaptureFixture[str]) -> str | None:
     return None
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.parametrize("verb", [verb for verb, _ in parsers(build_parser())], ids=" ".join)
 def test_a_value_that_no_argument_was_made_for_gets_one_message(
     verb: tuple[str, ...],

@@ -255,6 +255,7 @@ def test_no_process_of_any_kind_that_verbs_start_imports_from_the_working_direct
     assert (process.returncode, traps.caught()) == (0, {}), said
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "search_path",
     [
@@ -277,6 +278,7 @@ def test_an_empty_entry_of_pythonpath_is_not_the_working_directory_of_children(
     assert caught == {}
 
 
+@pytest.mark.slow
 def test_a_folder_that_pythonpath_names_is_searched_also_if_it_is_the_working_directory(
     tmp_path: Path,
 ) -> None:

@@ -55,6 +55,7 @@ def merged(root: Path, out: Path) -> tuple[Path, list[int]]:
     return out / "merged", [2, 3, 4, 0, 1]
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("edit", [deleted, split, merged])
 def test_what_lerobots_tool_leaves_can_be_adopted_and_trained_on(
     ours: Path, tmp_path: Path, edit: Callable[[Path, Path], tuple[Path, list[int]]]

@@ -49,6 +49,7 @@ def assert_same(ours: dict[str, Any], theirs: dict[str, Any]) -> None:
             assert ours[key] == value, key
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("storage", ["disk", pytest.param("ram", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     "options",

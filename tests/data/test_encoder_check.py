@@ -37,6 +37,7 @@ def lerobot_encodes(settings: EncoderSettings, file: Path) -> bool:
     return True
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize(("vcodec", "pix_fmt"), list(itertools.product(SOFTWARE, FORMATS)))
 def test_what_passes_is_what_lerobot_encodes(vcodec: str, pix_fmt: str, tmp_path: Path) -> None:
     for crf in (0, 12, 63):

@@ -100,6 +100,7 @@ def test_any_dataset_is_read_right_or_refused_with_the_place(good: Path, data: s
     )
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", sorted(CHANGES))
 @settings(max_examples=N_SINGLE, derandomize=True, suppress_health_check=list(HealthCheck), deadline=None)
 @given(data=st.data())

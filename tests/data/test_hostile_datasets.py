@@ -82,6 +82,7 @@ def read_all(root: Path) -> None:
     _ = dataset[0], dataset.meta.episodes[0], dataset.meta.tasks, dataset.hf_dataset[:]
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("kind", OPENS_PATHS)
 @pytest.mark.parametrize("scheme", ["reference", "http", "path", "zip"])
 def test_no_column_of_any_type_is_opened(recorded: Path, bait: Bait, kind: str, scheme: str) -> None:
@@ -140,6 +141,7 @@ def verbs(root: Path, other: Path, out: Path) -> dict[str, list[str]]:
     }
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("verb", verbs(Path(), Path(), Path()))
 @pytest.mark.parametrize("scheme", ["reference", "http"])
 def test_no_verb_opens_what_a_column_names(

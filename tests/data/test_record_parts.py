@@ -67,6 +67,7 @@ def files(root: Path) -> dict[str, bytes]:
     }
 
 
+@pytest.mark.slow
 def test_the_merged_dataset_has_the_bytes_of_one_recording(home: Path) -> None:
     (facts,) = write_recording(merge_recordings([home / "part-2", home / "part-1"]), home / "merged")
 

@@ -46,6 +46,7 @@ def dataset(root: Path, cache: Path, memory: SampleMemory, **options: Any) -> Re
     return RememberedFramesDataset(LeRobotDataset("local/tiny", root=root, **options), memory, cache=cache)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("rule", CHOICES)
 @pytest.mark.parametrize("cameras", [(BASE,), (WRIST, BASE)])
 def test_every_sample_shows_the_frames_that_a_rollout_shows_for_any_number_of_action_steps(

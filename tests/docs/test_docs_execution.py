@@ -125,6 +125,7 @@ def _serves_no_one() -> Iterator[None]:
         yield
 
 
+@pytest.mark.sampled(6)
 @pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("command", EXECUTED)
 def test_a_command_of_the_docs_is_executed(

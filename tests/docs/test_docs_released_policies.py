@@ -89,6 +89,7 @@ def write_server(name: str, folder: Path, port: int) -> None:
     (folder / name).write_text(text)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("name", list(STAND_INS))
 def test_a_server_keeps_the_protocol_and_its_sessions_apart(name: str, tmp_path: Path) -> None:
     port = free_port()

@@ -32,6 +32,7 @@ def small(source: list[str]) -> list[str]:
     return [text]
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_a_notebook_runs_from_the_first_cell_to_the_last(path: Path, tmp_path: Path) -> None:
     notebook = read(path)

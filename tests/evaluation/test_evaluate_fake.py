@@ -270,6 +270,7 @@ class TestRunSeeds:
 
 
 class TestOneCheckpointPerTask:
+    @pytest.mark.slow
     def test_a_run_grows_by_a_task_with_its_checkpoint_and_refuses_another_one(self, bench: Bench) -> None:
         color, shell = "RememberColor3-v0", "ShellGameTouch-v0"
         first, second, third = (bench.write_policy(name=name, pause=i / 1e6) for i, name in enumerate("abc"))

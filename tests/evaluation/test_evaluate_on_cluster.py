@@ -36,6 +36,7 @@ def expect_whole(bench: Bench, summary: EvaluationSummary, **fields: Any) -> Non
     assert len(bench.lines("local")) == N_EPISODES
 
 
+@pytest.mark.slow
 def test_records_are_those_of_the_process_pool(bench: Bench, three_machines: ThreeMachines) -> None:
     backend = three_machines.backend()
     assert backend.n_cores == 3

@@ -194,6 +194,7 @@ def wait_long() -> None:
     """Answer nothing: the client's patience ends."""
 
 
+@pytest.mark.sampled(2)
 @pytest.mark.parametrize(
     ("what", "kind"),
     [

@@ -173,6 +173,7 @@ class TestCommandLine:
         assert main(command) == 0
         assert "all 2 episodes are there" in capsys.readouterr().err
 
+    @pytest.mark.slow
     def test_an_audit_is_merged_evaluation_by_evaluation_and_then_printed(
         self, bench: Bench, capsys: pytest.CaptureFixture[str]
     ) -> None:

@@ -224,6 +224,7 @@ def test_with_several_gpus_each_has_a_server_and_records_are_the_same(
     assert network.lines("one") == network.lines("two")
 
 
+@pytest.mark.slow
 def test_a_server_that_dies_costs_errors_that_a_resume_heals(network: Bench) -> None:
     class Kills:
         def on_start(self, plan: Plan, *, n_finished: int, n_workers: int) -> None:

@@ -16,6 +16,7 @@ cache_of_its_own = test_model_table.cache_of_its_own
 small = test_model_table.small
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tasks", "left_out"),
     [

@@ -206,6 +206,7 @@ def config_of(draw: Any, kind: str, numbers: st.SearchStrategy[Any] | None = Non
     return {"type": kind, **FEATURES, **{name: value(name) for name in some}}
 
 
+@pytest.mark.sampled(7)
 @given(data=st.data())
 @pytest.mark.parametrize("kind", FAMILIES)
 def test_a_configuration_of_any_family_is_accepted_or_refused(folder: Path, kind: str, data: Any) -> None:
@@ -213,6 +214,7 @@ def test_a_configuration_of_any_family_is_accepted_or_refused(folder: Path, kind
     accepted_or_refused(lambda: read_config(folder, LoadOptions(device="cpu")))
 
 
+@pytest.mark.sampled(5)
 @given(data=st.data())
 @pytest.mark.parametrize("kind", ["act", "diffusion", "mikasa_memory", "mikasa_octo", "mikasa_sequence"])
 def test_a_network_of_any_configuration_is_built_or_refused(folder: Path, kind: str, data: Any) -> None:

@@ -83,6 +83,7 @@ def test_json_is_read_or_refused(root: Path, name: Path, data: st.DataObject) ->
         read_one_way(root, data)
 
 
+@pytest.mark.sampled(3)
 @given(data=st.data())
 @pytest.mark.parametrize("name", [INFO, STATS, EPISODES, FRAMES, TASKS, VIDEO])
 def test_torn_and_flipped_bytes_are_read_or_refused(root: Path, name: Path, data: st.DataObject) -> None:
@@ -141,6 +142,7 @@ def changed_table(table: Any, data: st.DataObject) -> Any:  # Any: pyarrow.Table
     return table.append_column("more", column) if what == "add" else table.set_column(at, name, column)
 
 
+@pytest.mark.sampled(3)
 @given(data=st.data())
 @pytest.mark.parametrize("name", [EPISODES, FRAMES, TASKS])
 def test_other_columns_and_rows_are_read_or_refused(root: Path, name: Path, data: st.DataObject) -> None:

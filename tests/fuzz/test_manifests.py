@@ -196,6 +196,7 @@ def test_a_shard_with_such_a_sentence_is_read(root: Path) -> None:
     assert shard_episodes(root) == (EPISODE,)
 
 
+@pytest.mark.sampled(3)
 @given(data=st.data())
 @pytest.mark.parametrize("name", WRITTEN, ids=str)
 def test_other_json_is_accepted_or_refused_with_a_message(root: Path, name: Path, data: Any) -> None:

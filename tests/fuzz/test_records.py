@@ -107,6 +107,7 @@ def test_other_bytes_are_accepted_or_refused_with_a_message(
         read_and_resume(put(valid, tmp_path / "run", name, damaged), name)
 
 
+@pytest.mark.sampled(4)
 @settings(max_examples=30)
 @given(data=st.data())
 @pytest.mark.parametrize(

@@ -68,6 +68,7 @@ def test_with_weights_of_zero_a_chunk_is_the_unguided_one_bit_for_bit(pi0: Path,
     assert chunk(made, told(committed(3), 1)).tobytes() != plain.tobytes()
 
 
+@pytest.mark.slow
 def test_guided_chunks_are_nearer_to_the_committed_rows_than_unguided_ones(pi0: Path, env: EnvSpec) -> None:
     plain, made = make_tiny(context_for(env), checkpoint=str(pi0)), policy(pi0, env)
     scale = statistics()["action"]["std"]

@@ -47,6 +47,7 @@ def remote(server: Any, env: EnvSpec) -> RemotePolicy:
     return make_remote(two_slots(env), url=server.url)
 
 
+@pytest.mark.slow
 def test_a_served_policy_keeps_the_contract_of_a_memory(gru: Path, env: EnvSpec) -> None:
     with served(gru) as server:
         made = [remote(server, env) for _ in range(3)]

@@ -40,6 +40,7 @@ class StopsAfter:
         return False
 
 
+@pytest.mark.slow
 def test_a_restart_in_the_middle_costs_errors_that_a_resume_heals(bench: Bench) -> None:
     def write_recipe(url: str) -> None:
         recipe = {"version": 1, "description": "d", "adapter": "remote"}

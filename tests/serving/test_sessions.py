@@ -283,6 +283,7 @@ class TestLimits:
                 begun(table_, "b", connection=1)  # whose own is idle or not, it has none
         assert table_.forgotten == [] and len(table_) == 1
 
+    @pytest.mark.slow
     def test_no_machine_takes_the_place_of_others_however_many_connections_it_opens(self) -> None:
         table_ = table()
         other = begun(table_, "other", connection=-1, address="there")

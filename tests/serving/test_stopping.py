@@ -98,6 +98,7 @@ def close_code(client: ClientConnection) -> int | None:
     return client.close_code
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("mode", "code"),
     [
@@ -138,6 +139,7 @@ def test_a_policy_with_a_thread_that_never_ends_does_not_keep_the_server(tmp_pat
         assert ends_in(process) < LIMIT_SECONDS
 
 
+@pytest.mark.slow
 def test_clients_that_read_nothing_or_never_stop_sending_do_not_keep_the_server(tmp_path: Path) -> None:
     with serving("fast", tmp_path) as (process, url), ExitStack() as opened:
         parts = urlsplit(url)

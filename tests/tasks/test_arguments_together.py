@@ -68,6 +68,7 @@ def begin(self: Any, *_: Any, control_mode: str, **__: Any) -> None:
     self.agent = type("Agent", (), {"control_mode": control_mode})()
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("row", TASKS.values(), ids=lambda row: row.id)
 def test_planning_refuses_what_the_class_refuses_in_the_same_words(
     row: TaskSpec, monkeypatch: pytest.MonkeyPatch

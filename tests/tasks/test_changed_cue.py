@@ -165,6 +165,7 @@ def test_cubes_that_are_shown_together_cannot_be_shuffled() -> None:
         make("BunchOfColors3-v0", shuffle_cue=True)
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.parametrize("name", APPEARANCES)
 def test_another_look_changes_images_and_no_state(name: str) -> None:
     usual = frames("RememberColor3-v0", 3, cue_steps=1, delay_steps=1)

@@ -77,6 +77,7 @@ def test_the_arm_moves_as_with_maniskill_s_own_controllers_to_the_last_bit(
     assert np.ptp(states[0][:-1:2], axis=0).max() > 0.1, "the arm did not move"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("mode", "arguments"),
     [*((mode, {}) for mode in MODES), *((EE_DELTA_POSE, {event: True}) for event in BEFORE_THE_CHOICE)],

@@ -140,6 +140,7 @@ def test_ball_is_shown_and_then_mugs_stand_upright_on_the_table_one_over_the_bal
             env.step(env.hold_action())
 
 
+@pytest.mark.sampled(3)
 def test_an_episode_has_no_past(sampled_task: str) -> None:
     """Bit-equal states in a fresh environment, and in one used for other episodes, in any order."""
     env = make(sampled_task)
@@ -200,6 +201,7 @@ def test_infos_of_earlier_steps_keep_their_values() -> None:
     assert int(early["elapsed_steps"][0]) == 0
 
 
+@pytest.mark.sampled(3)
 def test_success_and_states_do_not_depend_on_the_reward_mode(sampled_task: str) -> None:
     outcomes = []
     for mode in ("dense", "normalized_dense", "sparse", "none"):

@@ -20,6 +20,7 @@ from vla_eval.testing import check_env, check_policy, check_task
 FAKE = EnvSettings(task="RememberColor3-v0", simulator="fake", cameras=("base_camera", "hand_camera"))
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("n_episodes", [1, pytest.param(10, marks=pytest.mark.slow)])
 def test_our_tasks_pass(sampled_task: str, n_episodes: int) -> None:
     check_task(sampled_task, n_episodes=n_episodes)
@@ -235,6 +236,7 @@ class OneBit:
         return ActionChunk(actions=np.full((self.spec.chunk_size, 7), value, dtype=np.float32))
 
 
+@pytest.mark.sampled(8)
 @pytest.mark.parametrize("memory", MEMORIES)
 @pytest.mark.parametrize("bit", BITS)
 def test_one_memory_for_all_slots_is_noticed_whatever_is_left_of_an_observation(

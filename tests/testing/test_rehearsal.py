@@ -26,6 +26,7 @@ pytestmark = pytest.mark.usefixtures("no_network")
 BYTES_PER_NUMBER = 4  # of tiny recipes, all float32
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     ("recipe", "tiny"),
     [
@@ -99,6 +100,7 @@ def test_a_folder_that_is_there_is_left_alone(tmp_path: Path) -> None:
         rehearse("octo_tiny", RehearsalOptions(folder=tmp_path))
 
 
+@pytest.mark.slow
 def test_stand_ins_for_the_tokenizers_of_pi0_fast_name_every_token_that_it_can_predict(
     tmp_path: Path,
 ) -> None:

@@ -3,6 +3,7 @@
 from pathlib import Path
 from types import SimpleNamespace
 
+import pytest
 import torch
 
 from tests.testing.script_files import load_script
@@ -12,6 +13,7 @@ from vla_eval.models.shared.earlier_frames import SEGMENT_PADDING_KEY
 speed = load_script("training_speed")
 
 
+@pytest.mark.slow
 def test_a_step_with_memory_tokens_is_measured_on_sequences(no_network: None, tmp_path: Path) -> None:
     found = speed.measure_steps("pi05_memory_tokens", tmp_path / "step", device="cpu", n_steps=1, tiny=True)
     assert found["batch_size"] == 2 and found["step_seconds"] > 0

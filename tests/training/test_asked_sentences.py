@@ -205,6 +205,7 @@ def raising(lines: list[str]) -> Any:
 
 
 class TestOneSentence:
+    @pytest.mark.sampled(2)
     @pytest.mark.parametrize("inference", ["in_process", "shared"])
     def test_an_evaluation_says_each_once_wherever_the_policy_is(
         self, inference: str, trained: Path, prompts: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -251,6 +252,7 @@ class TestOneSentence:
 
 
 class TestCutSentences:
+    @pytest.mark.slow
     def test_training_check_and_evaluation_name_what_a_tokenizer_cuts_once(
         self,
         recorded: Path,

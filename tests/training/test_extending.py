@@ -49,6 +49,7 @@ def with_slow_weights(dataset: Path, out: Path, **changes: Any) -> FinetuneConfi
     return test_offline_rl_to_eval.tiny("iql", dataset, out, policy=policy, **changes)
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("kind", [act, with_cosine, with_slow_weights])
 def test_an_extended_training_is_the_longer_one_bit_for_bit(
     recorded: Path, tmp_path: Path, kind: Callable[..., FinetuneConfig]
@@ -158,6 +159,7 @@ from vla_eval.cli.main import main
 sys.exit(main(sys.argv[1:]))"""
 
 
+@pytest.mark.slow
 def test_a_finished_training_says_so_in_seconds_and_without_torch(recorded: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     flags = [*("finetune", "--policy", "act", "--dataset", str(recorded), "--allow-unreplayed")]
@@ -212,6 +214,7 @@ DAMAGES: dict[str, Callable[[dict[str, Any]], object]] = {
 }
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_a_damaged_record_is_one_message(recorded: Path, tmp_path: Path, damage: str) -> None:
     file = tmp_path / "run/finetune.json"

@@ -40,6 +40,7 @@ WAYS: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("way", WAYS)
 def test_the_run_resumes_and_its_newest_step_is_found(
     recorded: Path, stopped: Path, tmp_path: Path, way: str

@@ -162,6 +162,7 @@ def test_the_table_has_the_types_of_the_installed_lerobot() -> None:
     assert sorted(table()) == lerobots_types()
 
 
+@pytest.mark.sampled(7)
 @pytest.mark.parametrize(
     "kind",
     [
@@ -192,6 +193,7 @@ def by_step(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Path]:
 
 
 class TestAskedForSteps:
+    @pytest.mark.slow
     def test_the_contract_is_kept_in_several_slots(self, by_step: Path) -> None:
         check_policy(lambda: loaded(by_step), make_env(FAKE).spec)
 

@@ -63,6 +63,7 @@ def acted(run: Path, task: str, instruction: str) -> str | None:
     return record.trajectory_sha256
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "policy", [pytest.param(x, marks=pytest.mark.slow) if x == "memory_many" else x for x in TINY]
 )

@@ -47,6 +47,7 @@ def weights(run: Path) -> dict[str, torch.Tensor]:
     return dict(load_file(find_checkpoint(run) / "model.safetensors"))
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("recipe", ["cql", "cql_published", "iql"])
 def test_a_run_that_was_killed_ends_with_the_very_weights_of_one_that_was_not(
     recipe: str, recorded: Path, tmp_path: Path, killed_at: KilledAt

@@ -139,6 +139,7 @@ def test_a_training_that_fails_tells_its_services(
     assert fake.calls[-1] == "close"
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize(
     ("module", "fields", "install"),
     [
@@ -213,6 +214,7 @@ def logged_steps(folder: Path) -> list[int]:
     return steps
 
 
+@pytest.mark.sampled(4)
 @pytest.mark.usefixtures("no_account")
 @pytest.mark.parametrize("name", ["plain", "run[1]*"])
 @pytest.mark.parametrize("cleaned", [False, True])

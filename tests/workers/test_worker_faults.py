@@ -185,5 +185,6 @@ def test_a_fork_server_that_is_killed_costs_no_episode(tmp_path: Path) -> None:
     assert run_with_server(signal.SIGKILL, tmp_path / "out", setup_seconds=200) == "0 0"
 
 
+@pytest.mark.slow
 def test_a_fork_server_that_is_stopped_costs_no_episode(tmp_path: Path) -> None:
     assert run_with_server(signal.SIGSTOP, tmp_path / "out", setup_seconds=200) == "0 0"

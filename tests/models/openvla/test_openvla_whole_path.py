@@ -60,6 +60,7 @@ def loaded(published: Path, tmp_path: Path, case: str, **changes: Any) -> Loaded
     return load_checkpoint(converted(published, tmp_path, case, **changes), LoadOptions(device="cpu"))
 
 
+@pytest.mark.sampled(5)
 @pytest.mark.parametrize("case", CASES)
 def test_an_episode_executes_what_the_original_predicts(
     published: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, case: str
@@ -98,6 +99,7 @@ def test_an_image_of_another_size_is_resized_and_cropped_as_by_the_original(
     assert float((levels.round() != expected).float().mean()) < 0.01
 
 
+@pytest.mark.sampled(3)
 @pytest.mark.parametrize("case", ["img1.prompt1", "img2.prompt1", "img2.prompt2.proprio"])
 def test_the_loss_of_the_policy_and_its_parts_are_the_originals(
     published: Path, tmp_path: Path, case: str
