@@ -193,6 +193,21 @@ def test_the_audit_that_ships_is_of_present_tasks_and_in_the_docs(monkeypatch: p
         assert render_audit(shown, "markdown") in (DOCS / f"{name}.md").read_text(encoding="utf-8")
 
 
+def test_the_stored_frames_that_ship_are_of_present_tasks_and_in_the_docs(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.undo()
+    _read_again()
+    page = (DOCS / "audit.md").read_text(encoding="utf-8")
+    assert set(stored_frames()) <= set(TASKS)
+    for one in stored_frames().values():
+        assert one.verdict == (SEVERAL if SEVERAL in (one.probes, one.verdict) else ONE)
+        assert (one.verdict == ONE) == (one.n_frames == 1)
+        counts = (one.newest, one.first, one.cue_end, one.best, one.all, one.n_frames)
+        cells = " | ".join(map(str, (one.task, one.asked, f"{one.chance:.2f}", *counts)))
+        assert f"| {cells} | {one.probes} | {one.verdict} |" in page
+
+
 @pytest.mark.parametrize(
     ("found", "message"),
     [
