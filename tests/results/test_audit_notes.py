@@ -123,7 +123,10 @@ def test_a_note_says_of_which_tasks_one_frame_has_to_be_stored_and_of_which_seve
     audited.STORED_FRAMES_FILE.write_text(render_stored_frames(rows, "json"), encoding="utf-8")
     _read_again()
     (note,) = audit_notes([run_of(task) for task in (COLOR, SHELL, seq, chain)])
-    assert f"; one stored frame is enough: {COLOR}; several stored frames: {seq} (audit" in note
+    assert (
+        f"; one stored frame is enough to remember the cue of {COLOR}; it takes several stored frames to "
+        f"remember the cue of {seq} (audit" in note
+    )
 
 
 def test_every_verdict_of_an_audit_has_words_for_readers() -> None:

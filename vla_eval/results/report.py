@@ -21,7 +21,7 @@ from vla_eval.results.shipped_audit import (
     OTHER_VERDICTS,
     PROTOCOLS,
     ROADS,
-    UNREAD,
+    STORED,
     AuditProtocol,
     TaskAudit,
     protocol_of,
@@ -133,6 +133,6 @@ def _stored(audits: Mapping[str, TaskAudit]) -> list[str]:
     found: dict[str, list[str]] = {}
     for task, audit in audits.items():
         frames = stored_frames().get(task)
-        if frames is not None and frames.version == audit.version and frames.verdict != UNREAD:
+        if frames is not None and frames.version == audit.version and frames.verdict in STORED:
             found.setdefault(frames.verdict, []).append(task)
-    return [f"{verdict}: {', '.join(tasks)}" for verdict, tasks in sorted(found.items())]
+    return [f"{STORED[verdict]} {', '.join(tasks)}" for verdict, tasks in sorted(found.items())]

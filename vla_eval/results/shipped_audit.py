@@ -60,6 +60,11 @@ OTHER_VERDICTS: Mapping[str, str] = {
 
 ONE, SEVERAL = "one stored frame is enough", "several stored frames"
 UNREAD = "not read by linear probes"
+STORED: Mapping[str, str] = {
+    ONE: "one stored frame is enough to remember the cue of",
+    SEVERAL: "it takes several stored frames to remember the cue of",
+}
+"""A verdict about what has to be stored -> its words in a note, before the tasks."""
 Asked = Literal["item", "set", "order"]
 """Of `StoredFrames`: the item; the set of items; the items in the order shown."""
 
