@@ -2,7 +2,7 @@
 
 import os
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -88,14 +88,29 @@ class _Log:
     shown: list[NDArray[np.bool_]] = field(default_factory=list)
 
 
-class MemoryLog(StepObserver):
-    """A `StepObserver` that reads the memory of a policy after each inference."""
+class NpzLog(StepObserver):
+    """A `StepObserver` that keeps arrays of each episode, and writes a file of each once it has a record."""
+
+    def __init__(self, folder: str, file: Callable[[Path, EpisodeRecord], Path]) -> None:
+        """Files go into this folder of a run folder, and are named by `file`; none before `write`."""
+        self._folder, self._file = folder, file
+        self._logs: dict[int, _Log] = {}
+
+    def write(self, starts: Sequence[EpisodeStart], records: Sequence[EpisodeRecord], run: Path) -> None:
+        """Write the file of each episode into a run folder, whole or not at all."""
+        (run / self._folder).mkdir(exist_ok=True)
+        for start, record in zip(starts, records, strict=True):
+            _write(self._logs[start.slot], self._file(run, record))
+
+
+class MemoryLog(NpzLog):
+    """Reads the memory of a policy after each inference."""
 
     def __init__(self, policy: RememberingPolicy) -> None:
         """Nothing is written before `write`."""
+        super().__init__(MEMORIES, memory_file)
         self._policy = policy
         self._newest: dict[int, Observation] = {}
-        self._logs: dict[int, _Log] = {}
 
     def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
         """Begin an episode."""
@@ -114,19 +129,13 @@ class MemoryLog(StepObserver):
         images = self._newest[episode.slot].images
         log.frames.append({camera: small(image, FRAME_PX) for camera, image in images.items()})
 
-    def write(self, starts: Sequence[EpisodeStart], records: Sequence[EpisodeRecord], folder: Path) -> None:
-        """Write the file of each episode, whole or not at all."""
-        (folder / MEMORIES).mkdir(exist_ok=True)
-        for start, record in zip(starts, records, strict=True):
-            _write(self._logs[start.slot], memory_file(folder, record))
 
-
-class FrameLog(StepObserver):
-    """A `StepObserver` that keeps a small frame of each control step until the response, and of its first."""
+class FrameLog(NpzLog):
+    """Keeps a small frame of each control step until the response, and of its first."""
 
     def __init__(self) -> None:
         """Nothing is written before `write`."""
-        self._logs: dict[int, _Log] = {}
+        super().__init__(FRAMES, frames_file)
         self._waiting: set[int] = set()  # slots before the response
 
     def wants_images(self, step: int) -> bool:
@@ -154,12 +163,6 @@ class FrameLog(StepObserver):
             log.shown.append(np.isin(candidates, seen.privileged.shown_candidates))
         if result.status.phase == "response":
             self._waiting.discard(slot)
-
-    def write(self, starts: Sequence[EpisodeStart], records: Sequence[EpisodeRecord], folder: Path) -> None:
-        """Write the file of each episode, whole or not at all."""
-        (folder / FRAMES).mkdir(exist_ok=True)
-        for start, record in zip(starts, records, strict=True):
-            _write(self._logs[start.slot], frames_file(folder, record))
 
 
 def _write(log: _Log, path: Path) -> None:

@@ -36,7 +36,7 @@ from vla_eval.errors import (
 from vla_eval.evaluation.donors import donor_memories, donor_settings
 from vla_eval.evaluation.episode_jobs import EpisodeGroup, EpisodeJob
 from vla_eval.evaluation.job_queue import EpisodeBatch
-from vla_eval.evaluation.memory_log import FrameLog, MemoryLog
+from vla_eval.evaluation.memory_log import FrameLog, MemoryLog, NpzLog
 from vla_eval.memory_change import ChangedMemory, memory_parts
 from vla_eval.models.shared.sentence_reading import ReadingPolicy, SentenceReading
 from vla_eval.policies.compiled import CompiledPolicy
@@ -179,22 +179,16 @@ class EpisodeRunner:
         tapes = self._capture.tapes(starts, with_images=self._is_live(group)) if self._capture else None
         count = _StepCount(self._heartbeat, functools.partial(self._tell_sentences, group, policy))
         observers: list[StepObserver] = [count, *([tapes] if tapes else [])]
-        memories = None
-        if self._memories_in is not None and isinstance(policy, RememberingPolicy) and policy.spec.has_memory:
-            memories = MemoryLog(policy)
-            observers.append(memories)
-        frames = FrameLog() if self._frames_in is not None else None
-        observers += [frames] if frames is not None else []
+        logs = self._logs(policy)
+        observers += [log for log, _ in logs]
         records = rollout(env, changed, starts, group.rollout, observers=observers, heartbeat=self._heartbeat)
         if self._asks_memory:
             self._asks_memory = False
             self._tell(MemoryFound(policy=group.key.policy, parts=memory_parts(policy, starts[0])))
         # The recipe's name, whatever the adapter calls itself: records are distinguished by it.
         named = tuple(dataclasses.replace(record, policy=group.key.policy) for record in records)
-        if memories is not None and self._memories_in is not None:
-            memories.write(starts, named, self._memories_in)
-        if frames is not None and self._frames_in is not None:
-            frames.write(starts, named, self._frames_in)
+        for log, run in logs:
+            log.write(starts, named, run)
         timings = self._heartbeat.timings([job.key for job in batch.jobs])
         if self._capture and tapes:
             self._capture.write(
@@ -207,6 +201,15 @@ class EpisodeRunner:
                 film=lambda tape: tape if self._is_live(group) else self._filmed(tape, group),
             )
         return Finished(records=named, timings=timings)
+
+    def _logs(self, policy: Policy) -> list[tuple[NpzLog, Path]]:
+        """Return what keeps arrays of these episodes, and the run folder that it writes into."""
+        found: list[tuple[NpzLog, Path]] = []
+        if self._memories_in is not None and isinstance(policy, RememberingPolicy) and policy.spec.has_memory:
+            found.append((MemoryLog(policy), self._memories_in))
+        if self._frames_in is not None:
+            found.append((FrameLog(), self._frames_in))
+        return found
 
     def _with_changed_memory(
         self, policy: Policy, group: EpisodeGroup, starts: Sequence[EpisodeStart]
