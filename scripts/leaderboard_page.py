@@ -38,6 +38,9 @@ Read before you compare:
 A [protocol](protocols.md) gives your own runs the figure that stands in the column *mean*.
 """
 
+BEST = """\
+The highest published rate of each task. It is no ranking: these rows were not measured alike."""
+
 
 def page() -> str:
     """Return the page's Markdown."""
@@ -46,8 +49,18 @@ def page() -> str:
     for name in published.boards:
         parts.append(f"## `{name}`")
         parts.append(write_tables(published_side_tables(name), "markdown"))
+        parts += _best(published, name)
     parts.append(_sources(published))
     return "\n\n".join(parts) + "\n"
+
+
+def _best(published: Published, board: str) -> list[str]:
+    lines = [
+        f"- {task}: {found[0].rates[task].rate:.2f} ({', '.join(one.label for one in found)})"
+        for task in published.boards[board].tasks
+        if (found := published.best_of(task, board=board))
+    ]
+    return ["\n".join([BEST, "", *lines])] if lines else []
 
 
 def _sources(published: Published) -> str:

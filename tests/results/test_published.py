@@ -68,6 +68,39 @@ def test_they_are_marked_in_csv_and_json() -> None:
     assert data["published"]["rows"][0]["rates"] == {}
 
 
+def test_what_is_inferred_is_marked_and_never_a_value() -> None:
+    rates, how = published_side_tables(BOARD)
+    k = {row[0]: row[1] for row in rates.rows}
+    assert k["SimpleMemVLA"] == "perhaps"  # 8 of 16 in its evaluator, not stated for the figure
+    tasks = {row[0]: row[3] for row in how.rows}
+    assert (tasks["SimpleMemVLA"], tasks["Chameleon"], tasks["GMP"]) == ("perhaps", "—", "MIKASA-Robo v0")
+    assert any("perhaps K: 8 of 16" in note and "is inferred" in note for note in rates.notes)
+    with pytest.raises(RecipeError, match="no value beside perhaps"):
+        replace(load_published().results[0], n_action_steps=8, perhaps={"n_action_steps": "8"})
+    with pytest.raises(RecipeError, match="a field of a published result"):
+        replace(load_published().results[0], perhaps={"horizons": "90"})
+
+
+def test_what_is_from_a_digest_alone_is_marked() -> None:
+    rates, _ = published_side_tables("mikasa_vla_90")
+    assert {row[0]: row[2] for row in rates.rows}["OpenVLA-OFT with the first frame †"] == "0.850"
+    assert any(note.startswith("†: read in digests") for note in rates.notes)
+
+
+def test_the_best_of_a_task_is_a_result_of_others() -> None:
+    published = load_published()
+    tasks = published.boards[BOARD].tasks
+    best = {task: published.best_of(task, board=BOARD) for task in tasks}
+    assert [(one.method, one.rates[task].rate) for task, (one,) in best.items()] == [
+        ("GMP", 0.98),
+        ("GMP", 0.83),
+        ("ELMUR", 0.89),
+        ("GMP", 0.61),
+        ("ELMUR", 0.23),
+    ]
+    assert published.best_of("RememberColor4-v0", board=BOARD) == ()
+
+
 def test_the_papers_table_is_part_of_the_same_file() -> None:
     cells = {(one.model, one.n_action_steps, one.task): one.success_once for one in paper_figures()}
     assert len(cells) == 25  # five rows, five tasks

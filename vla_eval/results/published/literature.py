@@ -1,9 +1,9 @@
 """Published results as data, from `published.yaml`; a value that a source does not state is None."""
 
 import functools
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from vla_eval.errors import unknown_name
 from vla_eval.strict.bounds import require
@@ -13,6 +13,7 @@ from vla_eval.strict.yaml_data import load_yaml
 PUBLISHED_FILE = Path(__file__).with_name("published.yaml")
 PAPER = "mikasa"  # key of the benchmark's paper among the sources
 PAPER_FAMILY = "VLA"
+MEASURED_HERE, DIGEST = "[measured here]", "†"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,10 +51,13 @@ class PublishedResult:
     """One method as one source reports it. None, or nothing, is what the source does not state."""
 
     method: str
-    family: str
     source: str  # key of `Published.sources`; where: the place in it
     board: str  # key of `Published.boards`
+    family: str | None = None
     where: str | None = None
+    # read in the source itself, or in digests of a source that could not be read
+    read: Literal["source", "digest"] = "source"
+    suite: str | None = None  # whose tasks of these names
     control_mode: str | None = None
     image_px: int | None = None
     n_action_steps: int | None = None
@@ -64,14 +68,23 @@ class PublishedResult:
     spread: str | None = None  # which spread the rates have
     rates: dict[str, PublishedRate] = field(default_factory=dict)
     mean: PublishedRate | None = None  # as the source states it
+    # field of this class -> what is inferred of it and not known; such a field has no value
+    perhaps: dict[str, str] = field(default_factory=dict)
     differs: tuple[str, ...] = ()  # what is known to differ from the protocol or from other rows
     contested: dict[str, str] = field(default_factory=dict)  # task -> what contradicts its rate
     is_measured_here: bool = False
 
+    def __post_init__(self) -> None:
+        known = {one.name: getattr(self, one.name) for one in fields(self)}
+        for name in self.perhaps:
+            require(name in known, f"{self.method}: perhaps", name, "a field of a published result")
+            require(known[name] is None, f"{self.method}: {name}", known[name], "no value beside perhaps")
+
     @property
     def label(self) -> str:
-        """The method, with a mark if it was measured by this project."""
-        return f"{self.method} [measured here]" if self.is_measured_here else self.method
+        """The method, with a mark if it was measured by this project or is from a digest alone."""
+        marks = [MEASURED_HERE] * self.is_measured_here + [DIGEST] * (self.read == "digest")
+        return " ".join((self.method, *marks))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,6 +111,12 @@ class Published:
         if name not in self.boards:
             raise unknown_name("list of published results", name, self.boards, where="--published")
         return tuple(one for one in self.results if one.board == name)
+
+    def best_of(self, task: str, *, board: str) -> tuple[PublishedResult, ...]:
+        """Return the results of others with the highest rate of a task on a board; none without a rate."""
+        rated = [one for one in self.of_board(board) if task in one.rates and not one.is_measured_here]
+        highest = max((one.rates[task].rate for one in rated), default=None)
+        return tuple(one for one in rated if one.rates[task].rate == highest)
 
     def mean_of(self, result: PublishedResult) -> float | None:
         """Return the mean over the board's tasks: as stated, or computed if every task has a rate."""

@@ -6,6 +6,7 @@ from functools import partial
 from vla_eval.config.files import to_data
 from vla_eval.results.printed_table import UNDEFINED, Column, SideTable, cells_of
 from vla_eval.results.published.literature import (
+    DIGEST,
     PaperFigure,
     Published,
     PublishedResult,
@@ -14,7 +15,7 @@ from vla_eval.results.published.literature import (
 )
 from vla_eval.results.success_table import Table
 
-CONTESTED, COMPUTED = "‡", "(computed)"
+CONTESTED, COMPUTED, PERHAPS = "‡", "(computed)", "perhaps"
 PAPER_SOURCE = "“Memory, Benchmark & Robots” (ICLR 2026), appendix “VLA baselines”, table of VLA models"
 NO_FIGURES = "The paper's table of VLA models has none of these tasks."
 PAPER_PROTOCOL = "mean ± SEM, 3 runs × 100 episodes"
@@ -27,7 +28,7 @@ def published_side_tables(board: str) -> list[SideTable]:
     tasks = published.boards[board].tasks
     columns: list[Column[PublishedResult]] = [
         Column("method (published)", lambda one: one.label, is_number=False),
-        Column("K", lambda one: _text(one.n_action_steps)),
+        Column("K", partial(_stated, "n_action_steps")),
         *(Column(task.removesuffix("-v0"), partial(_rate, task)) for task in tasks),
         Column("mean", partial(_mean, published)),
     ]
@@ -70,14 +71,15 @@ def _how_measured(published: Published, results: Sequence[PublishedResult]) -> S
     titles = {name: source.title for name, source in published.sources.items()}
     columns: list[Column[PublishedResult]] = [
         Column("method", lambda one: one.label, is_number=False),
-        Column("kind", lambda one: one.family, is_number=False),
+        Column("kind", partial(_stated, "family"), is_number=False),
         Column("source", lambda one: ", ".join(filter(None, (titles[one.source], one.where))), False),
-        Column("control mode", lambda one: one.control_mode or UNDEFINED, is_number=False),
-        Column("image", lambda one: f"{one.image_px} px" if one.image_px else UNDEFINED, is_number=False),
-        Column("models", lambda one: one.training or UNDEFINED, is_number=False),
-        Column("runs", lambda one: _text(one.runs)),
-        Column("episodes", lambda one: _text(one.episodes)),
-        Column("seeds", lambda one: one.seeds or UNDEFINED, is_number=False),
+        Column("tasks of", partial(_stated, "suite"), is_number=False),
+        Column("control mode", partial(_stated, "control_mode"), is_number=False),
+        Column("image (px)", partial(_stated, "image_px")),
+        Column("models", partial(_stated, "training"), is_number=False),
+        Column("runs", partial(_stated, "runs")),
+        Column("episodes", partial(_stated, "episodes")),
+        Column("seeds", partial(_stated, "seeds"), is_number=False),
     ]
     return SideTable(
         title="How the published results were measured, as far as the sources say",
@@ -109,13 +111,18 @@ def _notes(published: Published, results: Sequence[PublishedResult]) -> Iterator
         yield f"{COMPUTED}: mean of the rates in the row; the source states none."
     for kind in dict.fromkeys(one.spread for one in results if one.spread):
         yield f"±: {kind}, where the source states it."
+    if any(one.read == "digest" for one in results):
+        yield f"{DIGEST}: read in digests; the source itself could not be read."
+    if any(one.perhaps for one in results):
+        yield f"{PERHAPS}: inferred from what was read elsewhere, not stated for this figure; see its note."
     for one in results:
         for task, text in one.contested.items():
             yield f"{CONTESTED} contested: {one.method} on {task}, {text}."
     for one in results:
         k = "" if one.n_action_steps is None else f" at K = {one.n_action_steps}"
-        if one.differs:
-            yield f"{one.label}{k}: {'; '.join(one.differs)}."
+        perhaps = [f"{PERHAPS} {_words(name)}: {text}" for name, text in one.perhaps.items()]
+        if perhaps or one.differs:
+            yield f"{one.label}{k}: {'; '.join((*perhaps, *one.differs))}."
 
 
 def _csv_rows(published: Published, result: PublishedResult) -> Iterator[dict[str, object]]:
@@ -142,5 +149,13 @@ def _json(published: Published, results: Sequence[PublishedResult]) -> list[dict
     return rows
 
 
-def _text(value: int | None) -> str:
-    return UNDEFINED if value is None else str(value)
+def _stated(name: str, result: PublishedResult) -> str:
+    """Return a field as the source states it, or the mark of what is inferred, or of what is unknown."""
+    value = getattr(result, name)
+    if value is not None:
+        return str(value)
+    return PERHAPS if name in result.perhaps else UNDEFINED
+
+
+def _words(name: str) -> str:
+    return {"n_action_steps": "K", "suite": "tasks"}.get(name, name)
