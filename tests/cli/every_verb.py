@@ -45,6 +45,7 @@ COMMANDS = {
     "report": "report {W}/run --html {W}/page",
     "compare": "compare {W}/run",
     "reproduce": f"reproduce 100/100 --task {TASK} --policy oracle --loss 0.3 {FAKE} --out {{W}}/reproduced",
+    "passport": "passport {W}/run GMP",
     "check": "check oracle",
     "audit": f"audit --task {TASK} --control hold --protocol paper --episodes 2 {FAKE} --out {{W}}/audit",
     "probe": f"probe --task {TASK} --policy cue_blind --episodes 2 {FAKE} --out {{W}}/probe",

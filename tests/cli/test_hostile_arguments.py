@@ -29,6 +29,7 @@ NEEDED: dict[tuple[str, ...], str] = {
     ("merge",): "nothing --out new",
     ("compare",): "nothing",
     ("reproduce",): f"100/100 --task {TASK} --policy oracle --set simulator=fake",
+    ("passport",): "nothing",
     ("check",): "oracle",
     ("audit",): f"--task {TASK} --set simulator=fake",
     ("probe",): f"--task {TASK} --policy oracle --set simulator=fake",

@@ -49,6 +49,12 @@ MISTAKES: dict[str, dict[str, str]] = {
         "reproduce 100/100 --policy oracle": "of which task",
         f"reproduce 100/100 --policy orcale --task {TASK} {FAKE}": "Did you mean 'oracle'",
     },
+    "passport": {
+        "passport runs/nowhere": "runs/nowhere",
+        "passport empty": "empty",
+        "passport GPM": "Did you mean 'GMP'",
+        "passport OpenVLA": "Name one of OpenVLA K=4, OpenVLA K=8",
+    },
     "check": {
         "check orcale": "Did you mean 'oracle'",
         "check runs/nowhere": "runs/nowhere",

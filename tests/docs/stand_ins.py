@@ -13,6 +13,7 @@ import pandas as pd
 from vla_eval.cli.main import main
 from vla_eval.config.files import list_recipes
 from vla_eval.data.manifest import MIKASA_FOLDER
+from vla_eval.results.published.literature import load_published
 from vla_eval.tasks.catalog import TASKS
 from vla_eval.testing.synthetic import write_synthetic_dataset
 
@@ -139,7 +140,7 @@ STAND_INS: dict[str, Callable[[str], Path]] = {
     r"data/edited": edited,
     r"data/.*": dataset,
     r"view runs/look|report runs/films": captured,
-    r"(report|compare|show|view) .*": run,
+    r"(report|compare|passport|show|view) .*": run,
     r".*": checkpoint,
 }
 """Path, or verb and path -> what stands for it; the first that matches counts."""
@@ -167,4 +168,5 @@ def missing(words: tuple[str, ...]) -> list[str]:
 
 def _is_path(text: str) -> bool:
     looks_so = "/" in text or text.isupper() or text.endswith(".yaml")
-    return looks_so and text not in list_recipes("policies") and not re.fullmatch(r"\d+/\d+", text)
+    named = (*list_recipes("policies"), *(one.method for one in load_published().results))
+    return looks_so and text not in named and not re.fullmatch(r"\d+/\d+", text)

@@ -72,13 +72,24 @@ def test_what_is_inferred_is_marked_and_never_a_value() -> None:
     rates, how = published_side_tables(BOARD)
     k = {row[0]: row[1] for row in rates.rows}
     assert k["SimpleMemVLA"] == "perhaps"  # 8 of 16 in its evaluator, not stated for the figure
-    tasks = {row[0]: row[3] for row in how.rows}
+    tasks = {row[0]: row[how.titles.index("tasks of")] for row in how.rows}
     assert (tasks["SimpleMemVLA"], tasks["Chameleon"], tasks["GMP"]) == ("perhaps", "—", "MIKASA-Robo v0")
     assert any("perhaps K: 8 of 16" in note and "is inferred" in note for note in rates.notes)
     with pytest.raises(RecipeError, match="no value beside perhaps"):
         replace(load_published().results[0], n_action_steps=8, perhaps={"n_action_steps": "8"})
     with pytest.raises(RecipeError, match="a field of a published result"):
         replace(load_published().results[0], perhaps={"horizons": "90"})
+
+
+def test_published_rows_are_ranked_only_within_one_table_of_one_source() -> None:
+    _, how = published_side_tables(BOARD)
+    letters: dict[str, set[str]] = {}
+    for row in how.rows:
+        letters.setdefault(row[1], set()).add(row[0])
+    # The paper's VLAs at K = 4; OpenVLA at K = 8 stands apart, beside itself at K = 4.
+    assert {"Octo-small", "OpenVLA", "SpatialVLA", "π0"} in letters.values()
+    assert {"MemoryVLA", "CronusVLA"} in letters.values()
+    assert {"OpenVLA", "GMP", "SimpleMemVLA", "Chameleon", "MemoryVLA++", "ELMUR"} <= letters["apart"]
 
 
 def test_what_is_from_a_digest_alone_is_marked() -> None:

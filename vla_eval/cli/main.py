@@ -25,6 +25,7 @@ VERBS: Mapping[str, str] = {
     "merge": "put the shards of a run together",
     "compare": "compare chunk lengths or policies with a reference",
     "reproduce": "find out whether a policy is as good as was claimed",
+    "passport": "say how a figure was made, and whether two may be ranked",
     "check": "check whether a policy, or a policy server, keeps its contract",
     "audit": "find the tasks that can be won without memory",
     "probe": "find out what a policy remembers, and for how long",

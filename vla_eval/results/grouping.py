@@ -7,23 +7,14 @@ from itertools import chain
 from typing import NamedTuple
 
 from vla_eval.records import EpisodeRecord
+from vla_eval.results.passport.settings import variant_labels
 from vla_eval.storage.planned import bare_name, bare_task, parts_of
-from vla_eval.storage.run_file import JsonValue, leaves
+from vla_eval.storage.run_file import JsonValue
 from vla_eval.storage.run_folder import StoredRun
 
-VARIANT_FIELDS = (
-    *("env", "chunking", "render", "stop_at_success", "reset_policy_at_step", "prompt_set", "simulator"),
-    *("sim_backend", "cue_view", "memory_change", "appearance"),
-)
-"""Fields of a configuration that affect success rates and are not part of an episode's key."""
-
 POLICY_NAMES = "policy_names"  # the policies' names in records, in the configuration of a run
-TASK_VERSIONS = "task_versions"  # task id -> version of its rules, in the configuration of a run
-PROMPTS = "prompts/"  # recipes whose names have this prefix hold the instructions
 WEIGHTS = "checkpoints/"  # recipes whose names have this prefix are the weights of a policy
 BASE = "base"  # after the policy's name: the base checkpoint of its adapter
-DIGITS = 8
-DEFAULT = "default"
 
 
 class RowKey(NamedTuple):
@@ -220,40 +211,6 @@ def _is_same(one: EpisodeRecord, other: EpisodeRecord) -> bool:
     if "error" in (one.outcome, other.outcome):
         return one == other
     return one.trajectory_sha256 is not None and one.trajectory_sha256 == other.trajectory_sha256
-
-
-def variant_labels(runs: Sequence[StoredRun]) -> list[dict[str, str | None]]:
-    """Return for each run: task -> what it sets that differs between runs (nothing: `DEFAULT`), or None."""
-    settings = [_settings(run) for run in runs]
-    names = sorted({name for values in settings for name in values})
-    differing = [name for name in names if len({values.get(name) for values in settings}) > 1]
-    versions: dict[str, set[object]] = defaultdict(set)
-    for run in runs:
-        for task in {record.task for record in run.records}:
-            versions[task].add(_task_version(run, task))
-    labels = []
-    for run, values in zip(runs, settings, strict=True):
-        own = [f"{name}={values[name]}" for name in differing if name in values]
-        parts = own or ([DEFAULT] if differing else [])
-        label_of: dict[str, str | None] = {}
-        for task in {record.task for record in run.records}:
-            version = [f"task version {_task_version(run, task)}"] if len(versions[task]) > 1 else []
-            label_of[task] = ", ".join((*parts, *version)) or None
-        labels.append(label_of)
-    return labels
-
-
-def _settings(run: StoredRun) -> dict[str, str]:
-    chosen = {name: run.description.config[name] for name in VARIANT_FIELDS if name in run.description.config}
-    settings = {path: text.strip('"') for path, text in leaves(chosen, prefix="")}
-    # Other weights of a policy may be another training run; another instruction is another variant.
-    prompts = {name: digest for name, digest in run.description.recipes.items() if name.startswith(PROMPTS)}
-    return settings | {name: digest[:DIGITS] for name, digest in prompts.items()}
-
-
-def _task_version(run: StoredRun, task: str) -> object:
-    versions = run.description.config.get(TASK_VERSIONS)
-    return versions.get(task) if isinstance(versions, Mapping) else None
 
 
 def config_names(run: StoredRun, field: str) -> tuple[str, ...]:

@@ -5,9 +5,10 @@ from collections.abc import Collection, Mapping, Sequence
 
 from vla_eval.results.comparison import Success, compare
 from vla_eval.results.estimates import LEVEL
-from vla_eval.results.grouping import RowKey
+from vla_eval.results.grouping import RowEpisodes, RowKey
 from vla_eval.results.latex import latex_first, latex_text
 from vla_eval.results.own_statistics import EPISODES, SUCCESS
+from vla_eval.results.passport.ranking import NOT_RANKED
 from vla_eval.results.relative_statistics import BY_ARITHMETIC, CHANCE, against_chance
 from vla_eval.results.success_table import Row, Table
 
@@ -36,7 +37,7 @@ def paper_preset(table: Table) -> str:
     labels = dict.fromkeys(row.key.of_all_tasks for row in table.rows)
     names = {label: _name(label, list(labels), table.variants) for label in labels}
     cells = {(row.key.of_all_tasks, row.task): row for row in table.rows}
-    best = _best(table.rows)
+    best = _best(table)
     width = max([len(CHANCE_NAME), *map(len, names.values())]) * SMALL_PT + COLUMN_SPACE_PT
     n_side_by_side = max(1, int((LINE_WIDTH_PT - width) / _cell_width_pt(table.rows, tasks)))
     blocks = [tasks[i : i + n_side_by_side] for i in range(0, len(tasks), n_side_by_side)]
@@ -105,18 +106,24 @@ def _row(name: str, rows: Sequence[Row | None], is_best: Sequence[bool]) -> list
     ]
 
 
-def _best(rows: Sequence[Row]) -> set[RowKey]:
-    """Return each task's best policy, if above chance and, by paired tests, unlike the next one."""
-    pairs = {}
-    for task in dict.fromkeys(row.task for row in rows):
-        learned = [row for row in rows if row.task == task and row.policy not in CONTROLS]
+def _best(table: Table) -> set[RowKey]:
+    """Return the best policy of each task and setting, if above chance and, by paired tests, unlike the next.
+
+    Rows whose passports differ in a setting are not ranked.
+    """
+    alike: dict[object, list[Row]] = {}
+    for row in table.rows:
+        if row.policy not in CONTROLS:
+            alike.setdefault((row.task, table.passports[row.key].standing), []).append(row)
+    pairs: dict[object, tuple[RowEpisodes, RowEpisodes]] = {}
+    for place, learned in alike.items():
         rates = ((row[SUCCESS].success_once, row) for row in learned)
         known = [(rate, row) for rate, row in rates if rate is not None]
         ranked = sorted(known, key=lambda one: -one[0])
         if len(ranked) > 1 and ranked[0][0] > ranked[1][0] and _is_above_chance(ranked[0][1]):
-            pairs[task] = (ranked[0][1].episodes, ranked[1][1].episodes)
+            pairs[place] = (ranked[0][1].episodes, ranked[1][1].episodes)
     found = compare(pairs)
-    return {pairs[task][0].key for task, one in found.items() if one.corrected_p < LEVEL}
+    return {pairs[place][0].key for place, one in found.items() if one.corrected_p < LEVEL}
 
 
 def _is_above_chance(row: Row) -> bool:
@@ -181,6 +188,8 @@ def _caption(table: Table) -> str:
             "Bold: the best policy of a task, where it is above chance and differs from the next one on the "
             f"same episodes (exact paired test, $p < {LEVEL:g}$ after Holm's correction)."
         )
+        if any(note.startswith(NOT_RANKED) for note in table.notes):
+            sentences.append("Rows with another $K$ or other settings are not ranked against each other.")
     controls = dict.fromkeys(row.policy for row in rows if row.policy in CONTROLS)
     if controls:
         said = "; ".join(f"{latex_text(name)}: {CONTROLS[name]}" for name in controls)

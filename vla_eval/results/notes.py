@@ -6,15 +6,15 @@ from itertools import product
 from typing import NamedTuple
 
 from vla_eval.errors import MAX_NAMED, some_of
-from vla_eval.results.grouping import PROMPTS, Grouping, config_names, texts_of
+from vla_eval.results.grouping import Grouping, config_names, texts_of
 from vla_eval.results.own_statistics import count
+from vla_eval.results.passport.settings import differing_environment, differing_recipes
 from vla_eval.storage.planned import named_checkpoints
-from vla_eval.storage.run_file import DEVICE, JsonValue, leaves
+from vla_eval.storage.run_file import JsonValue
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.tasks.catalog import find_task
 
-DEVICE_FACTS = f"{DEVICE}."
 UNCOMMITTED = "made with uncommitted changes to the package, which the commit does not contain."
 
 
@@ -46,8 +46,7 @@ def run_notes(runs: Sequence[StoredRun], grouping: Grouping) -> list[str]:
         seen = seen_in_training((record.key for record in run.records), run.description.training_seeds)
         own += [*_incomplete(run), *_continued_elsewhere(run), *seen]
     sentences = dict.fromkeys(line for run in runs for session in run.sessions for line in session.sentences)
-    differences = (*_environment_differences(runs), *_recipe_differences(runs))
-    return [*_told_together(notes), *own, *sentences, *_absent_shards(runs), *differences]
+    return [*_told_together(notes), *own, *sentences, *_absent_shards(runs), *_differences(runs)]
 
 
 def _by_task(runs: Sequence[StoredRun]) -> list[str]:
@@ -152,29 +151,13 @@ def _continued_elsewhere(run: StoredRun) -> Iterator[str]:
         )
 
 
-def _environment_differences(runs: Sequence[StoredRun]) -> Iterator[str]:
-    texts = [dict(leaves(run.description.environment, prefix="")) for run in runs]
-    # A run without images has no renderer, and one of which no worker has started has no device at all: what
-    # is not known does not differ.
-    found = {
-        name: {text.get(name) for text in texts if name in text or not name.startswith(DEVICE_FACTS)}
-        for text in texts
-        for name in text
-    }
-    differing = [name for name, values in found.items() if len(values) > 1]
-    if differing:
-        yield f"the run folders were made in different environments; what differs: {some_of(differing)}."
-
-
-def _recipe_differences(runs: Sequence[StoredRun]) -> Iterator[str]:
-    digests: dict[str, set[str]] = defaultdict(set)
-    for run in runs:
-        for recipe, digest in run.description.recipes.items():
-            digests[recipe].add(digest)
-    # Other prompts are another variant, for which the table has a column.
-    differing = [name for name, found in digests.items() if len(found) > 1 and not name.startswith(PROMPTS)]
-    if differing:
+def _differences(runs: Sequence[StoredRun]) -> Iterator[str]:
+    """Name what differs between the passports of the run folders beyond their settings."""
+    environment, recipes = differing_environment(runs), differing_recipes(runs)
+    if environment:
+        yield f"the run folders were made in different environments; what differs: {some_of(environment)}."
+    if recipes:
         yield (
-            f"the run folders were made with different contents of {some_of(differing)}; rows of the same "
+            f"the run folders were made with different contents of {some_of(recipes)}; rows of the same "
             "name are combined anyway."
         )

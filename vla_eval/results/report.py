@@ -14,8 +14,11 @@ from vla_eval.results.comparison import (
     success_of,
 )
 from vla_eval.results.formats import FORMATS, Format
-from vla_eval.results.grouping import group_runs
+from vla_eval.results.grouping import RowKey, group_runs
+from vla_eval.results.latex_preset import CONTROLS
 from vla_eval.results.notes import run_notes
+from vla_eval.results.passport.passport import Passport
+from vla_eval.results.passport.ranking import not_ranked
 from vla_eval.results.published.protocol_summary import protocol_summaries
 from vla_eval.results.shipped_audit import (
     OTHER_VERDICTS,
@@ -28,6 +31,7 @@ from vla_eval.results.shipped_audit import (
     shipped_audits,
     stored_frames,
 )
+from vla_eval.results.side_by_side.of_row import passports_of
 from vla_eval.results.statistics import make_row, row_notes
 from vla_eval.results.success_table import Row, Table
 from vla_eval.results.table_formats import render
@@ -67,15 +71,32 @@ def build_table(
     evidence = gather_evidence(grouping.groups, compared).values()
     rows = tuple(map(make_row, evidence))
     summaries = protocol_summaries(runs, grouping, names=protocols)
+    passports = passports_of(grouping)
     return Table(
         rows=rows,
         run_rows=tuple(row for of in evidence if of.success.n_runs > 1 for row in _run_rows(of)),
-        notes=(*audit_notes(runs), *row_notes(rows), *run_notes(runs, grouping), *summaries.notes),
+        notes=(
+            *audit_notes(runs),
+            *row_notes(rows),
+            *not_ranked(_ranked_rows(passports)),
+            *run_notes(runs, grouping),
+            *summaries.notes,
+        ),
         baselines=baselines,
         n_comparisons=sum(one is not None for found in compared.values() for one in found),
         runs={str(run.path): run.description.name for run in runs},
         protocols=summaries.rows,
+        passports=passports,
     )
+
+
+def _ranked_rows(passports: Mapping[RowKey, Passport]) -> dict[str, list[Passport]]:
+    """Return task -> the passports of its rows, but those of controls, which no one ranks."""
+    found: dict[str, list[Passport]] = {}
+    for key, one in passports.items():
+        if key.policy not in CONTROLS:
+            found.setdefault(key.task, []).append(one)
+    return found
 
 
 def _run_rows(of: Evidence) -> list[Row]:

@@ -1,11 +1,12 @@
 """The success table as data: what a statistic is, the rows, and their notes."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 from vla_eval.results.comparison import Evidence
 from vla_eval.results.grouping import RowEpisodes, RowKey, Run
+from vla_eval.results.passport.passport import Passport
 from vla_eval.results.printed_table import Column
 
 Cell = str | int | float | None
@@ -114,6 +115,7 @@ class Table:
     runs: Mapping[str, str]  # run folder -> name of its configuration
     # the summary figures of published protocols, as far as the runs name any
     protocols: tuple[ProtocolRow, ...] = ()
+    passports: Mapping[RowKey, Passport] = field(default_factory=dict)  # how each row was made
 
     @property
     def variants(self) -> dict[str, str]:

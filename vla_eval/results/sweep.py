@@ -13,7 +13,8 @@ from vla_eval.errors import ReportError, check_names, unknown_name
 from vla_eval.results.comparison import Comparison, Evidence, compare, gather_evidence
 from vla_eval.results.estimates import LEVEL
 from vla_eval.results.formats import By
-from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs, variant_labels
+from vla_eval.results.grouping import RowEpisodes, RowKey, group_runs
+from vla_eval.results.passport.settings import variant_labels
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.catalog import find_task
 from vla_eval.tasks.spec import total_cue_steps

@@ -94,6 +94,7 @@ def _json(table: Table, sides: Sequence[SideTable]) -> str:
         "rows": [row.to_dict() for row in table.rows],
         "run_rows": [row.to_dict() for row in table.run_rows],
         "notes": list(table.notes),
+        "passports": [{**key._asdict(), **one.to_dict()} for key, one in table.passports.items()],
     }
     for side in sides:
         data |= side.json

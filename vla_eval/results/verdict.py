@@ -25,7 +25,8 @@ class Verdict(NamedTuple):
     """What a table shows of one task."""
 
     task: str
-    # the best policy first; one for all n_action_steps of a policy at which the same was found
+    # of rows with the same settings the best first; one for all n_action_steps of a policy at which the
+    # same was found
     sentences: tuple[str, ...]
     is_compared: bool  # whether any policy was compared with chance
 
@@ -41,16 +42,24 @@ def verdicts(table: Table) -> list[Verdict]:
         learned = [row for row in rows if row.policy not in CONTROLS]
         told = learned or [row for row in rows if row.policy == "oracle"]
         groups: dict[object, list[Row]] = {}
-        for row in sorted(told, key=_rank):
+        for row in _best_first(told, table):
             finding = _finding(row)
             key = (row.policy, row.variant, finding, None if finding in VERBS else row.n_action_steps)
             groups.setdefault(key, []).append(row)
-        sentences = [_sentence(group, rows) for group in groups.values()]
+        sentences = [_sentence(sorted(group, key=_rank), rows) for group in groups.values()]
         if any(_finding(row) == "chance unknown" for row in told):
             sentences.append(_unknown_chance(told))
         if sentences:
             found.append(Verdict(task, tuple(sentences), any(_finding(row) in VERBS for row in told)))
     return found
+
+
+def _best_first(rows: Sequence[Row], table: Table) -> list[Row]:
+    """Sort rows with the same settings by what they show; others keep the order of the table."""
+    alike: dict[object, list[Row]] = {}
+    for row in rows:
+        alike.setdefault(table.passports[row.key].standing, []).append(row)
+    return [row for group in alike.values() for row in sorted(group, key=_rank)]
 
 
 def _rank(row: Row) -> tuple[float, float]:

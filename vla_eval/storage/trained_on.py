@@ -11,18 +11,26 @@ TrainingSeeds = Mapping[str, Mapping[str, Sequence[SeedRange]]]
 """Policy, or its part of a task or run (`part_of`) -> task id -> the seeds of its demonstrations."""
 
 
+def seeds_of_training(
+    known: TrainingSeeds, *, policy: str, task: str, run: int
+) -> Sequence[SeedRange] | None:
+    """Return the seeds of a task whose demonstrations a policy was trained on; None if that is not known."""
+    parts = parts_of(policy, task=task, run=run)
+    own = next((known[part] for part in parts if known.get(part)), None)
+    return None if own is None else own.get(task, ())
+
+
 def seen_in_training(keys: Iterable[EpisodeKey], known: TrainingSeeds) -> list[str]:
     """Return a sentence for each policy and task with seeds that are known to be those of demonstrations."""
     seen: dict[tuple[str, str], set[int]] = defaultdict(set)
     asked: dict[tuple[str, str], set[int]] = defaultdict(set)
     for key in keys:
-        parts = parts_of(key.policy, task=key.task, run=key.run)
-        own = next((known[part] for part in parts if known.get(part)), None)
+        own = seeds_of_training(known, policy=key.policy, task=key.task, run=key.run)
         if own is None:
             continue
         place = (key.policy, key.task)
         asked[place].add(key.seed)
-        if any(key.seed in seeds for seeds in own.get(key.task, ())):
+        if any(key.seed in seeds for seeds in own):
             seen[place].add(key.seed)
     return [
         f"{policy} was trained on demonstrations of {len(seeds)} of the {len(asked[policy, task])} seeds it "

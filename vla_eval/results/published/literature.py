@@ -44,6 +44,8 @@ class Board:
     # whether the mean of all tasks is the figure that is compared; then it is computed where a source
     # states every task but no mean
     mean_over_tasks: bool
+    # task -> control steps of an episode in the suites of these names; the paper's table of tasks
+    horizon_steps: dict[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,6 +60,8 @@ class PublishedResult:
     # read in the source itself, or in digests of a source that could not be read
     read: Literal["source", "digest"] = "source"
     suite: str | None = None  # whose tasks of these names
+    robot: str | None = None
+    horizon: Literal["registered"] | None = None  # as long as the suite has them: `Board.horizon_steps`
     control_mode: str | None = None
     image_px: int | None = None
     n_action_steps: int | None = None

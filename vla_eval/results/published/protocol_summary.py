@@ -11,7 +11,9 @@ from vla_eval.config.protocol import Protocol, load_protocol
 from vla_eval.config.recorded_chunking import recorded_chunking
 from vla_eval.errors import RecipeError, UnknownNameError, some_of
 from vla_eval.results.estimates import estimate_runs, mean_interval
-from vla_eval.results.grouping import TASK_VERSIONS, VARIANT_FIELDS, Grouping, RowEpisodes, RowKey
+from vla_eval.results.grouping import Grouping, RowEpisodes, RowKey
+from vla_eval.results.passport.fields import setting_sections
+from vla_eval.results.passport.settings import task_version
 from vla_eval.results.success_table import ProtocolRow
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
@@ -162,8 +164,7 @@ def _setting_departures(
     for task, group in found.items():
         for run in grouping.folders[group.key]:
             texts.update(dict.fromkeys(_settings(protocol, run)))
-            versions = run.description.config.get(TASK_VERSIONS)
-            version = versions.get(task) if isinstance(versions, Mapping) else None
+            version = task_version(run, task)
             if version != protocol.tasks[task]:
                 known = "unknown version" if version is None else f"version {version}"
                 texts[f"{task} of {known} instead of {protocol.tasks[task]}"] = None
@@ -175,9 +176,10 @@ def _settings(protocol: Protocol, run: StoredRun) -> Iterator[str]:
     defaults = to_data(default)
     defaults["chunking"] = recorded_chunking(default.chunking, defaults["chunking"])
     config = run.description.config
-    expected = dict(leaves({name: defaults[name] for name in VARIANT_FIELDS}, prefix=""))
+    sections = setting_sections()
+    expected = dict(leaves({name: defaults[name] for name in sections}, prefix=""))
     # A field that a run does not name had its default in the version that wrote it.
-    own = dict(leaves({name: config[name] for name in VARIANT_FIELDS if name in config}, prefix=""))
+    own = dict(leaves({name: config[name] for name in sections if name in config}, prefix=""))
     for path, text in own.items():
         if text != expected.get(path) and not protocol.is_free(path):
             yield f"{path}={text.strip('"')}"

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 from vla_eval.config.files import to_data
+from vla_eval.results.passport.ranking import standing_letters
 from vla_eval.results.printed_table import UNDEFINED, Column, SideTable, cells_of
 from vla_eval.results.published.literature import (
     DIGEST,
@@ -13,8 +14,15 @@ from vla_eval.results.published.literature import (
     load_published,
     paper_figures,
 )
+from vla_eval.results.published.passports import passport_of_published
 from vla_eval.results.success_table import Table
 
+APART = "apart"
+ALL_APART = f"{APART}: no two rows are known to have been measured alike, so none are ranked."
+LETTERS = (
+    "ranked with: rows with the same letter agree in each setting that is stated, and stand in one table of "
+    f"one source. {APART}: a setting differs, or is unknown (`mikasa-vla passport` says which)."
+)
 CONTESTED, COMPUTED, PERHAPS = "‡", "(computed)", "perhaps"
 PAPER_SOURCE = "“Memory, Benchmark & Robots” (ICLR 2026), appendix “VLA baselines”, table of VLA models"
 NO_FIGURES = "The paper's table of VLA models has none of these tasks."
@@ -69,8 +77,11 @@ _PAPER_COLUMNS: tuple[Column[PaperFigure], ...] = (
 
 def _how_measured(published: Published, results: Sequence[PublishedResult]) -> SideTable:
     titles = {name: source.title for name, source in published.sources.items()}
+    passports = [passport_of_published(one, published) for one in results]
+    letters = dict(zip(map(id, results), standing_letters(passports), strict=True))
     columns: list[Column[PublishedResult]] = [
         Column("method", lambda one: one.label, is_number=False),
+        Column("ranked with", lambda one: letters[id(one)] or APART, is_number=False),
         Column("kind", partial(_stated, "family"), is_number=False),
         Column("source", lambda one: ", ".join(filter(None, (titles[one.source], one.where))), False),
         Column("tasks of", partial(_stated, "suite"), is_number=False),
@@ -85,6 +96,8 @@ def _how_measured(published: Published, results: Sequence[PublishedResult]) -> S
         title="How the published results were measured, as far as the sources say",
         columns=columns,
         rows=cells_of(columns, results),
+        notes=[LETTERS] if any(letters.values()) else [ALL_APART],
+        json={"published_passports": [{"method": one.subject, **one.to_dict()} for one in passports]},
     )
 
 

@@ -1,0 +1,1 @@
+"""How a figure was made: the fields that decide whether two figures may stand side by side."""

@@ -1,0 +1,1 @@
+"""Passports of measured rows, and two passports beside each other."""

@@ -1,0 +1,219 @@
+"""Read the passport of a measured row from its run folders."""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+from vla_eval.results.grouping import Grouping, RowEpisodes, RowKey
+from vla_eval.results.passport.fields import FIELDS, Kind, owner_of
+from vla_eval.results.passport.passport import Passport
+from vla_eval.results.passport.settings import (
+    DIGITS,
+    ENV,
+    arguments_of,
+    prompts_of,
+    settings_of,
+    task_of,
+    task_version,
+    usual_arguments,
+)
+from vla_eval.seeding import SeedRange, seed_ranges
+from vla_eval.storage.run_file import leaves
+from vla_eval.storage.run_folder import StoredRun
+from vla_eval.storage.trained_on import seeds_of_training
+from vla_eval.tasks.arguments import HORIZON, ROBOT
+from vla_eval.tasks.catalog import find_task
+from vla_eval.tasks.interface import IMAGE_SIZE
+
+NULL = "null"  # of JSON
+PANDA = "Panda"
+NONE = "none"
+AS_DESIGNED = "as designed"
+OWN = "this repository's"
+SUITES = {
+    "paper": OWN,
+    "mikasa_vla_90": "MIKASA-Robo-VLA",
+    "mikasa_official": "MIKASA-Robo v0",
+    "mikasa_base": "MIKASA-Base",
+}
+"""Suite of a task -> whose tasks they are, as published results say it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RowOfRun:
+    """One row, as one of its run folders has it."""
+
+    run: StoredRun
+    settings: Mapping[str, str]  # of the run: path -> text
+    episodes: RowEpisodes
+
+    @property
+    def key(self) -> RowKey:
+        """Task, policy, n_action_steps and variant."""
+        return self.episodes.key
+
+    def argument(self, name: str) -> str | None:
+        """Return an argument of the task, named or usual; None if it is not known."""
+        return _argument(self.settings, self.run, self.key.task, name)
+
+
+def _argument(settings: Mapping[str, str], run: StoredRun, task: str, name: str) -> str | None:
+    path = f"{ENV}{name}"
+    return settings.get(path) or usual_arguments(run, task).get(path)
+
+
+def passports_of(grouping: Grouping) -> dict[RowKey, Passport]:
+    """Return the passport of each row; what differs between the run folders of a row has several values."""
+    runs = {run.path: run for folders in grouping.folders.values() for run in folders}
+    settings = {path: settings_of(run) for path, run in runs.items()}
+    of_runs = {path: _values_of_run(run, settings[path]) for path, run in runs.items()}
+    found = {}
+    for key, group in grouping.groups.items():
+        folders = grouping.folders[key]
+        each = [
+            of_runs[run.path] | _values_of_row(RowOfRun(run=run, settings=settings[run.path], episodes=group))
+            for run in folders
+        ]
+        values = {one.name: tuple(dict.fromkeys(own[one.name] for own in each)) for one in FIELDS}
+        origin = str(folders[0].path)
+        found[key] = Passport(subject=str(key), origin=origin, is_measured=True, values=values)
+    return found
+
+
+def _values_of_row(row: RowOfRun) -> dict[str, str | None]:
+    return {name: read(row) for name, read in READERS.items()}
+
+
+def _values_of_run(run: StoredRun, settings: Mapping[str, str]) -> dict[str, str | None]:
+    """Return the fields that consist of leaves of `run.json`; None where the run has nothing of the kind."""
+    found: dict[str, list[str]] = {one.name: [] for one in FIELDS if one.name not in READERS}
+    environment = dict(leaves(run.description.environment, prefix=""))
+    kinds: Mapping[Kind, Mapping[str, str]] = {"setting": settings, "environment": environment}
+    for kind, texts in kinds.items():
+        for path, text in texts.items():
+            owner = owner_of(path, kind)
+            if owner is not None and owner.name in found and text != NULL:
+                found[owner.name].append(f"{_short(path)}={text.strip('"')}")
+    values: dict[str, str | None] = {name: ", ".join(texts) or None for name, texts in found.items()}
+    if values["world"] is None and arguments_of(run) is not None:
+        values["world"] = AS_DESIGNED
+    return values
+
+
+def _short(path: str) -> str:
+    """Return the path without the section that its field is about."""
+    return path.removeprefix(ENV).removeprefix("chunking.").removeprefix("render.")
+
+
+def _tasks(row: RowOfRun) -> str | None:
+    spec, version = find_task(row.key.task), task_version(row.run, row.key.task)
+    if spec is None or version is None:
+        return None
+    return f"{SUITES[spec.suite]}, version {version}" if spec.suite == "paper" else SUITES[spec.suite]
+
+
+def _instructions(row: RowOfRun) -> str | None:
+    found = prompts_of(row.run)
+    return ", ".join(f"{name} ({digest[:DIGITS]})" for name, digest in found.items()) or None
+
+
+def _control_mode(row: RowOfRun) -> str | None:
+    return NONE if _is_base(row) else row.argument("control_mode")
+
+
+def _image_size(row: RowOfRun) -> str | None:
+    size = row.argument(IMAGE_SIZE)
+    return NONE if _is_base(row) else None if size is None else f"{size} px"
+
+
+def _robot(row: RowOfRun) -> str | None:
+    env = arguments_of(row.run)
+    if _is_base(row):
+        return NONE
+    return None if env is None else str(env.get(ROBOT, PANDA))
+
+
+def horizon_of(run: StoredRun, task: str) -> int | None:
+    """Return the control steps of an episode of a task in a run; None if it is not known."""
+    steps = _argument(settings_of(run), run, task, HORIZON)
+    return None if steps is None else int(steps)
+
+
+def _horizon(row: RowOfRun) -> str | None:
+    steps = row.argument(HORIZON)
+    return None if steps is None else f"{steps} control steps"
+
+
+def _success_rule(row: RowOfRun) -> str | None:
+    env = arguments_of(row.run)
+    if env is None:
+        return None
+    parts = ["success at any step"]
+    parts += ["the first wrong choice ends the episode"] if env.get("strict_choice") is True else []
+    parts += ["stopped at the first success"] if row.run.description.config.get("stop_at_success") else []
+    return ", ".join(parts)
+
+
+def _is_base(row: RowOfRun) -> bool:
+    spec = task_of(row.run, row.key.task)
+    return spec is not None and spec.is_base
+
+
+def _seen_seeds(row: RowOfRun) -> str | None:
+    asked = {(run.index, seed) for run in row.episodes.runs for seed in run.records}
+    seen = {place for place in asked if any(place[1] in one for one in _trained_on(row, place[0]) or ())}
+    return f"{len(seen)} of {len(asked)} episodes" if seen else NONE
+
+
+def _trained_on(row: RowOfRun, index: int) -> Sequence[SeedRange] | None:
+    key = row.key
+    return seeds_of_training(row.run.description.training_seeds, policy=key.policy, task=key.task, run=index)
+
+
+def _demonstrations(row: RowOfRun) -> str | None:
+    if not any(run.weights for run in row.episodes.runs):
+        return None if _is_served(row) else NONE
+    found = [_trained_on(row, run.index) for run in row.episodes.runs]
+    if None in found:
+        return None
+    return _ranges(one for of_run in found if of_run is not None for one in of_run) or NONE
+
+
+def _weights(row: RowOfRun) -> str | None:
+    digests = sorted({one[:DIGITS] for run in row.episodes.runs for one in run.weights})
+    return ", ".join(digests) or (None if _is_served(row) else NONE)
+
+
+def _is_served(row: RowOfRun) -> bool:
+    """Whether the policy is behind a socket whose server does not say which weights it has."""
+    server = row.run.description.servers.get(row.key.policy)
+    return server is not None and not (isinstance(server, Mapping) and "weights_sha256" in server)
+
+
+def _seeds(row: RowOfRun) -> str:
+    return _ranges(seed_ranges(seed for run in row.episodes.runs for seed in run.records))
+
+
+def _ranges(found: Iterable[SeedRange]) -> str:
+    return ", ".join(
+        str(one.first) if one.first == one.last else f"{one.first} to {one.last}" for one in found
+    )
+
+
+READERS: Mapping[str, Callable[[RowOfRun], str | None]] = {
+    "tasks": _tasks,
+    "instructions": _instructions,
+    "control_mode": _control_mode,
+    "image_size": _image_size,
+    "robot": _robot,
+    "horizon": _horizon,
+    "n_action_steps": lambda row: str(row.key.n_action_steps),
+    "success_rule": _success_rule,
+    "seen_seeds": _seen_seeds,
+    "weights": _weights,
+    "training": lambda _: None,
+    "demonstrations": _demonstrations,
+    "seeds": _seeds,
+    "episodes": lambda row: str(len(row.episodes.results)),
+    "runs": lambda row: str(len(row.episodes.runs_with_results)),
+}
+"""Field -> how it is read; the others are the leaves of `run.json` that belong to them."""
