@@ -40,7 +40,11 @@ MISTAKES: dict[str, dict[str, str]] = {
         f"eval --task {TASK} --policy memory_color3 --n-action-steps 4 16 --dry-run": "chunks of 8 actions",
         **{f"eval --task {TASK} --policy oracle --dry-run {env}": said for env, said in WRONG_ENV.items()},
     },
-    "report": {"report runs/nowhere": "runs/nowhere", "report empty": "empty"},
+    "report": {
+        "report runs/nowhere": "runs/nowhere",
+        "report empty": "empty",
+        "report --imported nothing.json": "there is no such file",
+    },
     "merge": {"merge runs/nowhere --out new": "runs/nowhere"},
     "compare": {"compare runs/nowhere": "runs/nowhere"},
     "reproduce": {

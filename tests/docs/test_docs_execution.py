@@ -43,6 +43,7 @@ NOT_EXECUTED: Mapping[str, str] = {
     r"finetune .*base.checkpoint[ =]runs/decisions.*": (
         "a trained sequence policy; tests/training/test_sequence_to_eval.py"
     ),
+    r".*eval_info.json.*": "results of another program; tests/results/test_imported.py",
     r"merge .*-of-8.*": "eight shards; those of two are put together here",
     r"probe .* --probe appearance .*": "what the fake simulator does not draw; tests/probe/test_probe.py",
     r"probe probe|probe probe --set .*": "all changes of all tasks; tests/probe",

@@ -22,7 +22,7 @@ With two of them, also what differs, and what that may do to the figures. What i
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description, parser.epilog = DESCRIPTION, "docs/passport.md explains the fields."
-    what = "run folder (runs/…), or a published result of `report --published` (GMP, 'OpenVLA K=8')"
+    what = "run folder, file of another program, or published result (runs/first, eval_info.json, GMP)"
     parser.add_argument("first", metavar="A", help=what)
     parser.add_argument("second", nargs="?", metavar="B", help="likewise")
     add_flags(parser, "--format")
@@ -42,7 +42,9 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _figures(names: Sequence[str]) -> "list[Figure]":
-    """Read each run folder there is, and look for a published result of each other name."""
+    """Read each run folder and file there is, and look for a published result of each other name."""
+    from vla_eval.results.imported.reading import read_imported
+    from vla_eval.results.passport.passport import merged
     from vla_eval.results.published.literature import load_published
     from vla_eval.results.published.passports import find_published, passport_of_published
     from vla_eval.results.side_by_side.written import Figure, figure_of_run
@@ -50,7 +52,10 @@ def _figures(names: Sequence[str]) -> "list[Figure]":
 
     published, found = load_published(), {}
     for name in names:
-        if Path(name).exists() or "/" in name:
+        if Path(name).is_file():
+            rows = read_imported(Path(name))
+            found[name] = Figure(passport=merged([one.passport for one in rows], subject=name))
+        elif Path(name).exists() or "/" in name:
             found[name] = figure_of_run(read_run(Path(name)))
     tasks = {task for figure in found.values() for task in figure.tasks}
     for name in names:

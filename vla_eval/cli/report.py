@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_eval.cli.shared.arguments import MANY
-from vla_eval.cli.shared.output import add_table_arguments, print_in, print_table
+from vla_eval.cli.shared.output import add_table_arguments, imported_rows, print_in, print_table
 from vla_eval.cli.terminal.screen import print_markdown
 from vla_eval.errors import ReportError, some_of
 
@@ -18,7 +18,7 @@ DESCRIPTION = """Print the success table of one or more run folders; standard ou
 
 Each RUN is a folder that `mikasa-vla eval` made; a run may still be unfinished. Several runs go into one
 table: rows with the same task, policy, n_action_steps and settings are put together. Without a RUN,
---published prints published results alone.
+--published and --imported print published and imported results alone.
 
 With --html, a page with plots, choices, errors and videos is written instead, and its path printed. With
 --filmstrip, an image per row of the table: ten seeds, cue | reveal | touch."""
@@ -37,6 +37,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="also print the summary figure of this protocol (`mikasa-vla list protocols`); those that the "
         "runs name are always printed",
+    )
+    parser.add_argument(
+        "--imported",
+        **MANY,
+        default=[],
+        type=Path,
+        metavar="FILE",
+        help="print results that other programs counted beside yours (docs/imported.md lists the programs)",
     )
     columns = parser.add_argument("--columns", **MANY, default=[], metavar="NAME")
     columns.help = "only these, in this order, in formats for reading: %(names)s"
@@ -68,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.storage.run_folder import read_run
 
     if not args.runs:
-        return _print_published(args)
+        return _print_beside(args)
     runs = [read_run(path) for path in args.runs]
     if args.html is not None:
         _check_alone("--html writes a page", args)
@@ -98,19 +106,24 @@ def run(args: argparse.Namespace) -> int:
     return 0
 
 
-def _print_published(args: argparse.Namespace) -> int:
-    from vla_eval.results.table_formats import render_published
+def _print_beside(args: argparse.Namespace) -> int:
+    """Print published and imported results alone."""
+    from vla_eval.results.table_formats import render_beside
 
-    if args.published is None or args.html is not None or args.filmstrip is not None:
-        raise ReportError("Name at least one RUN, a run folder, or --published alone.")
-    print_in(args.format, render_published(args.published, args.format))
+    is_none = args.published is None and not args.imported
+    if is_none or args.html is not None or args.filmstrip is not None:
+        raise ReportError("Name at least one RUN, a run folder, or --published or --imported alone.")
+    rows = imported_rows(args.imported)
+    print_in(args.format, render_beside(args.format, published=args.published, imported=rows))
     return 0
 
 
 def _check_alone(written: str, args: argparse.Namespace) -> None:
-    if args.paper or args.columns or args.wide or args.preset or args.format != "markdown":
+    others = (args.paper, args.columns, args.wide, args.preset, args.imported, args.format != "markdown")
+    if any(others):
         raise ReportError(
-            f"{written}, which has no --format, --preset, --columns, --wide and --paper. Remove them."
+            f"{written}, which has no --format, --preset, --columns, --wide, --paper and --imported. Remove "
+            "them."
         )
 
 

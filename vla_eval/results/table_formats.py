@@ -8,6 +8,8 @@ from typing import Any
 from vla_eval.errors import ReportError
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.formats import FOR_READING, Format, Preset
+from vla_eval.results.imported.rows import ImportedRow
+from vla_eval.results.imported.table import imported_side_table
 from vla_eval.results.latex_preset import paper_preset
 from vla_eval.results.memory_types import memory_side_tables
 from vla_eval.results.own_statistics import mean_text, rate
@@ -26,6 +28,7 @@ def render(
     *,
     paper: bool = False,
     published: str | None = None,
+    imported: Sequence[ImportedRow] = (),
     columns: Sequence[str] = (),
     wide: bool = False,
     preset: Preset | None = None,
@@ -37,8 +40,9 @@ def render(
     `FITS_CHARACTERS`); `wide`: all of them, and a row per run. `csv` and `json` have every column in full
     precision. The preset `paper` is LaTeX with tasks as columns and policies as rows.
     """
-    check_format(fmt, columns=columns, wide=wide, preset=preset, beside=paper or published is not None)
-    sides = side_tables(table, paper=paper, published=published)
+    beside = paper or published is not None or bool(imported)
+    check_format(fmt, columns=columns, wide=wide, preset=preset, beside=beside)
+    sides = side_tables(table, paper=paper, published=published, imported=imported)
     if preset is not None:
         return paper_preset(table)
     if fmt == "csv":
@@ -53,10 +57,10 @@ def render(
     return write_tables([lay_out(table, names=columns, wide=wide, width=width), *sides], fmt)
 
 
-def render_published(board: str, fmt: Format) -> str:
-    """Write the published results of a board without measured ones; see `render`."""
+def render_beside(fmt: Format, *, published: str | None, imported: Sequence[ImportedRow]) -> str:
+    """Write published and imported results without measured ones; see `render`."""
     empty = Table(rows=(), notes=(), baselines=(), n_comparisons=0, runs={})
-    return render(empty, fmt, published=board)
+    return render(empty, fmt, published=published, imported=imported)
 
 
 def check_format(
@@ -66,19 +70,26 @@ def check_format(
     if preset is not None and (fmt != "latex" or columns or wide or beside):
         raise ReportError(
             f"--preset {preset} is a whole table in LaTeX, with its own columns. Add --format latex, and "
-            "remove --columns, --wide, --paper and --published."
+            "remove --columns, --wide, --paper, --published and --imported."
         )
     if fmt in ("csv", "json") and (columns or wide):
         flag = "--columns" if columns else "--wide"
         raise ReportError(f"{flag}: {fmt} has every column. Remove {flag}, or use {', '.join(FOR_READING)}.")
 
 
-def side_tables(table: Table, *, paper: bool = False, published: str | None = None) -> list[SideTable]:
+def side_tables(
+    table: Table,
+    *,
+    paper: bool = False,
+    published: str | None = None,
+    imported: Sequence[ImportedRow] = (),
+) -> list[SideTable]:
     """Return the tables below a success table; arguments as for `render`."""
     return [
         *([protocol_side_table(table)] if table.protocols else []),
         *memory_side_tables(table),
         *([paper_side_table(table)] if paper else []),
+        *([imported_side_table(imported)] if imported else []),
         *(published_side_tables(published) if published is not None else []),
     ]
 

@@ -14,6 +14,7 @@ from vla_eval.results.formats import PRESETS
 from vla_eval.storage.shard import Shard
 
 if TYPE_CHECKING:
+    from vla_eval.results.imported.rows import ImportedRow
     from vla_eval.storage.run_folder import StoredRun
 
 
@@ -58,6 +59,7 @@ def print_table(
         args.format,
         paper=args.paper,
         published=args.published,
+        imported=imported_rows(getattr(args, "imported", ())),
         columns=columns,
         wide=args.wide,
         preset=args.preset,
@@ -67,6 +69,13 @@ def print_table(
     if args.format == "csv":  # has no place for them
         for note in table.notes:
             print(f"note: {note}", file=sys.stderr)
+
+
+def imported_rows(paths: "Sequence[Path]") -> "list[ImportedRow]":
+    """Read the results of other programs, each file once."""
+    from vla_eval.results.imported.reading import read_imported
+
+    return [row for path in dict.fromkeys(paths) for row in read_imported(path)]
 
 
 def print_in(fmt: str, text: str) -> None:

@@ -4,6 +4,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from vla_eval.results.passport.fields import FIELDS, SETTINGS, Field
+from vla_eval.seeding import SeedRange
 
 UNKNOWN = "unknown"
 MAX_SHOWN = 4  # values of one field in a sentence
@@ -48,6 +49,13 @@ class Passport:
             self.values[one.name] if self.known(one.name) else (self.values[one.name], self.origin)
             for one in SETTINGS
         )
+
+
+def seeds_text(seeds: Iterable[SeedRange]) -> str:
+    """Return `1 to 100, 200`; empty without a seed."""
+    return ", ".join(
+        str(one.first) if one.first == one.last else f"{one.first} to {one.last}" for one in seeds
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

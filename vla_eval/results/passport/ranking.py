@@ -8,6 +8,7 @@ from vla_eval.results.passport.passport import Passport, classes
 
 DOCS = "docs/"
 NOT_RANKED = "not ranked against each other"
+APART = "apart"  # a row that may be ranked with no other one
 
 
 def not_ranked(rows: Mapping[str, Sequence[Passport]]) -> list[str]:

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from functools import partial
 
 from vla_eval.config.files import to_data
-from vla_eval.results.passport.ranking import standing_letters
+from vla_eval.results.passport.ranking import APART, standing_letters
 from vla_eval.results.printed_table import UNDEFINED, Column, SideTable, cells_of
 from vla_eval.results.published.literature import (
     DIGEST,
@@ -17,7 +17,6 @@ from vla_eval.results.published.literature import (
 from vla_eval.results.published.passports import passport_of_published
 from vla_eval.results.success_table import Table
 
-APART = "apart"
 ALL_APART = f"{APART}: no two rows are known to have been measured alike, so none are ranked."
 LETTERS = (
     "ranked with: rows with the same letter agree in each setting that is stated, and stand in one table of "

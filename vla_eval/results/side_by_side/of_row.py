@@ -1,11 +1,11 @@
 """Read the passport of a measured row from its run folders."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from vla_eval.results.grouping import Grouping, RowEpisodes, RowKey
 from vla_eval.results.passport.fields import FIELDS, Kind, owner_of
-from vla_eval.results.passport.passport import Passport
+from vla_eval.results.passport.passport import Passport, seeds_text
 from vla_eval.results.passport.settings import (
     DIGITS,
     ENV,
@@ -175,7 +175,7 @@ def _demonstrations(row: RowOfRun) -> str | None:
     found = [_trained_on(row, run.index) for run in row.episodes.runs]
     if None in found:
         return None
-    return _ranges(one for of_run in found if of_run is not None for one in of_run) or NONE
+    return seeds_text(one for of_run in found if of_run is not None for one in of_run) or NONE
 
 
 def _weights(row: RowOfRun) -> str | None:
@@ -190,13 +190,7 @@ def _is_served(row: RowOfRun) -> bool:
 
 
 def _seeds(row: RowOfRun) -> str:
-    return _ranges(seed_ranges(seed for run in row.episodes.runs for seed in run.records))
-
-
-def _ranges(found: Iterable[SeedRange]) -> str:
-    return ", ".join(
-        str(one.first) if one.first == one.last else f"{one.first} to {one.last}" for one in found
-    )
+    return seeds_text(seed_ranges(seed for run in row.episodes.runs for seed in run.records))
 
 
 READERS: Mapping[str, Callable[[RowOfRun], str | None]] = {

@@ -1,0 +1,1 @@
+"""Results that other programs counted: read, never mixed with measured rows."""
