@@ -43,7 +43,7 @@ def test_one_passport_is_printed_and_two_say_what_differs(
     text = capsys.readouterr().out
     assert "- Not to be ranked: K differs." in text
     # The fake simulator's usual horizon is not the task's.
-    assert "- Not to be ranked: not known of one or both: control mode, image size, horizon." in text
+    assert "- Not to be ranked: not known of one or both: control mode, image size and horizon." in text
     assert "2 seeds in common, of 3 and 2." in text
     assert main(["passport", runs[0], runs[0]]) == 0
     assert "they may be ranked" in capsys.readouterr().out.lower()

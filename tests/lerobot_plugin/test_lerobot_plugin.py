@@ -24,6 +24,7 @@ from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
 from vla_eval.features import dataset_features, proprioception
 from vla_eval.lerobot_plugin import MikasaEnvConfig, MikasaGym
+from vla_eval.results.imported.reading import read_imported
 from vla_eval.training.finetune import finetune
 
 TASK = "RememberColor3-v0"
@@ -187,6 +188,8 @@ class TestCommands:
         (info,) = tmp_path.glob("eval_info.json")
         overall = json.loads(info.read_text())["overall"]
         assert (overall["n_episodes"], overall["pc_success"]) == (2, 0.0)  # in two steps nobody gets there
+        (row,) = read_imported(info)
+        assert (row.program, row.n_success, row.n_episodes) == ("lerobot-eval", 0, 2)
 
     def test_lerobot_train_trains_two_steps_and_evaluates(
         self, recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -148,7 +148,6 @@ def test_standing_is_an_equivalence_and_order_does_not_matter() -> None:
         Passport(
             subject=f"{number}",
             origin=origin,
-            is_measured=False,
             values={one.name: ("x",) for one in FIELDS}
             | {"horizon": horizon, "n_action_steps": k, "image_size": size},
         )

@@ -50,7 +50,6 @@ class ImportedRow:
         return Passport(
             subject=f"{self.policy or self.file} on {self.task} ({self.program})",
             origin=self.file,
-            is_measured=False,
             values={one.name: (own.get(one.name),) for one in FIELDS},
             perhaps=self.perhaps,
         )

@@ -12,19 +12,18 @@ MAX_SHOWN = 4  # values of one field in a sentence
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Passport:
-    """What is known of how a figure, or the figures of a run folder, was made."""
+    """How a figure, or the figures of a run folder, was made, as far as it is known."""
 
     subject: str  # whose figure it is: `memory on RememberColor3-v0 K=4`, `GMP (published)`
     # figures of one origin share what it does not state: the run folder, or the table of a source
     origin: str
-    is_measured: bool  # by this program, from records that are there
-    # name of a field -> its value, several if there are several figures; one that is not known is None
+    # name of a field -> its value, several if there are several figures; None is unknown
     values: Mapping[str, tuple[str | None, ...]]
     # name of a field -> what may hold of it, and from where that is
     perhaps: Mapping[str, str] = field(default_factory=dict)
 
     def known(self, name: str) -> bool:
-        """Whether a field is known of all figures."""
+        """Whether a field is known for all figures."""
         found = self.values.get(name, ())
         return bool(found) and None not in found
 
@@ -98,4 +97,4 @@ def merged(passports: Sequence[Passport], *, subject: str) -> Passport:
         for one in FIELDS
     }
     first = passports[0]
-    return Passport(subject=subject, origin=first.origin, is_measured=first.is_measured, values=values)
+    return Passport(subject=subject, origin=first.origin, values=values)

@@ -28,7 +28,7 @@ def not_ranked(rows: Mapping[str, Sequence[Passport]]) -> list[str]:
             named |= dict.fromkeys(one.name for one in differing)
             tasks_of.setdefault(tuple(_named(one, firsts) for one in differing), []).append(task)
     notes = [
-        f"{NOT_RANKED}: rows of {some_of(tasks)} that differ in {_listed(parts)}."
+        f"{NOT_RANKED}: rows of {some_of(tasks)} that differ in {listed(parts)}."
         for parts, tasks in tasks_of.items()
     ]
     return [*notes, *(effect_of(one) for one in SETTINGS if one.name in named)]
@@ -51,6 +51,7 @@ def _named(field: Field, firsts: Iterable[Passport]) -> str:
     return f"{field.words} ({'; '.join(dict.fromkeys(one.text(field.name) for one in firsts))})"
 
 
-def _listed(parts: Sequence[str]) -> str:
+def listed(parts: Sequence[str]) -> str:
+    """Return `K`, or `image size, horizon and K`; there is at least one."""
     *before, last = parts
     return f"{', '.join(before)} and {last}" if before else last

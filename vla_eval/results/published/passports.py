@@ -43,7 +43,6 @@ def passport_of_published(
     return Passport(
         subject=f"{name_of(result)} (published)",
         origin=f"{result.source}, {result.where}",
-        is_measured=False,
         values=values,
         perhaps={STATED_AS.get(name, name): text for name, text in result.perhaps.items()},
     )

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from vla_eval.results.grouping import Grouping, RowEpisodes, RowKey
 from vla_eval.results.passport.fields import FIELDS, Kind, owner_of
@@ -43,7 +44,7 @@ class RowOfRun:
     """One row, as one of its run folders has it."""
 
     run: StoredRun
-    settings: Mapping[str, str]  # of the run: path -> text
+    settings: Mapping[str, str]  # path -> text: those of the run, and what holds without being named
     episodes: RowEpisodes
 
     @property
@@ -53,29 +54,26 @@ class RowOfRun:
 
     def argument(self, name: str) -> str | None:
         """Return an argument of the task, named or usual; None if it is not known."""
-        return _argument(self.settings, self.run, self.key.task, name)
-
-
-def _argument(settings: Mapping[str, str], run: StoredRun, task: str, name: str) -> str | None:
-    path = f"{ENV}{name}"
-    return settings.get(path) or usual_arguments(run, task).get(path)
+        return self.settings.get(f"{ENV}{name}")
 
 
 def passports_of(grouping: Grouping) -> dict[RowKey, Passport]:
     """Return the passport of each row; what differs between the run folders of a row has several values."""
-    runs = {run.path: run for folders in grouping.folders.values() for run in folders}
-    settings = {path: settings_of(run) for path, run in runs.items()}
-    of_runs = {path: _values_of_run(run, settings[path]) for path, run in runs.items()}
+    settings: dict[tuple[Path, str], dict[str, str]] = {}
+    of_runs: dict[Path, dict[str, str | None]] = {}
     found = {}
     for key, group in grouping.groups.items():
-        folders = grouping.folders[key]
-        each = [
-            of_runs[run.path] | _values_of_row(RowOfRun(run=run, settings=settings[run.path], episodes=group))
-            for run in folders
-        ]
+        folders, each = grouping.folders[key], []
+        for run in folders:
+            place = (run.path, key.task)
+            if run.path not in of_runs:
+                of_runs[run.path] = _values_of_run(run, settings_of(run))
+            if place not in settings:
+                settings[place] = usual_arguments(run, key.task) | settings_of(run)
+            row = RowOfRun(run=run, settings=settings[place], episodes=group)
+            each.append(of_runs[run.path] | _values_of_row(row))
         values = {one.name: tuple(dict.fromkeys(own[one.name] for own in each)) for one in FIELDS}
-        origin = str(folders[0].path)
-        found[key] = Passport(subject=str(key), origin=origin, is_measured=True, values=values)
+        found[key] = Passport(subject=str(key), origin=str(folders[0].path), values=values)
     return found
 
 
@@ -134,7 +132,7 @@ def _robot(row: RowOfRun) -> str | None:
 
 def horizon_of(run: StoredRun, task: str) -> int | None:
     """Return the control steps of an episode of a task in a run; None if it is not known."""
-    steps = _argument(settings_of(run), run, task, HORIZON)
+    steps = (usual_arguments(run, task) | settings_of(run)).get(f"{ENV}{HORIZON}")
     return None if steps is None else int(steps)
 
 

@@ -12,7 +12,7 @@ from vla_eval.results.formats import Format
 from vla_eval.results.grouping import Grouping, RowEpisodes, group_runs
 from vla_eval.results.passport.fields import FIELDS, Field
 from vla_eval.results.passport.passport import UNKNOWN, Difference, Passport, differences, merged
-from vla_eval.results.passport.ranking import effect_of
+from vla_eval.results.passport.ranking import effect_of, listed
 from vla_eval.results.printed_table import Column, PrintedTable, cells_of, csv_text, write_tables
 from vla_eval.results.side_by_side.of_row import horizon_of, passports_of
 from vla_eval.storage.run_folder import StoredRun
@@ -96,7 +96,7 @@ def _cell(passport: Passport, field: Field) -> str:
 
 
 def _says(passport: Passport, field: Field) -> bool:
-    """Whether a field is worth a line: a setting always, others if anything is known of them."""
+    """Whether a field is worth a line: a setting always, others if they have a value."""
     return field.kind == "setting" or any(value is not None for value in passport.values[field.name])
 
 
@@ -107,9 +107,9 @@ def _notes(figures: Sequence[Figure], found: Sequence[Difference]) -> Iterator[s
     if not settings:
         yield AGREE
     if differ:
-        yield f"Not to be ranked: {', '.join(differ)} differ{'s' * (len(differ) == 1)}."
+        yield f"Not to be ranked: {listed(differ)} differ{'s' * (len(differ) == 1)}."
     if unknown:
-        yield f"Not to be ranked: not known of one or both: {', '.join(unknown)}."
+        yield f"Not to be ranked: not known of one or both: {listed(unknown)}."
     yield from (effect_of(one.field) for one in settings if one.is_known)
     first, second = figures
     if first.grouping is not None and second.grouping is not None:
@@ -117,7 +117,7 @@ def _notes(figures: Sequence[Figure], found: Sequence[Difference]) -> Iterator[s
         yield _common_seeds(first.grouping, second.grouping)
     environment = [one.field.words for one in found if one.field.kind == "environment" and one.is_known]
     if environment:
-        yield f"Made in different environments ({', '.join(environment)}): what that does was not measured."
+        yield f"Made in different environments ({listed(environment)}): what that does was not measured."
 
 
 def _within_the_shorter(first: Grouping, second: Grouping) -> list[str]:
