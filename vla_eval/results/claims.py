@@ -10,7 +10,8 @@ from vla_eval.config.files import to_data
 from vla_eval.config.recorded_chunking import read_chunking
 from vla_eval.errors import RecipeError, some_of, unknown_name
 from vla_eval.results.acceptance import Claim
-from vla_eval.results.grouping import POLICY_NAMES, TASK_VERSIONS, RowEpisodes, RowKey, group_runs
+from vla_eval.results.grouping import POLICY_NAMES, RowEpisodes, RowKey, group_runs
+from vla_eval.results.passport.settings import TASK_VERSIONS, task_version
 from vla_eval.results.published.literature import PublishedResult, load_published
 from vla_eval.storage.run_folder import StoredRun, read_run
 from vla_eval.tasks.catalog import task_spec
@@ -102,8 +103,7 @@ def _claimed(run: StoredRun, row: RowEpisodes) -> Claimed:
 
 
 def _check_version(run: StoredRun, task: str) -> None:
-    versions = run.description.config.get(TASK_VERSIONS)
-    claimed = versions.get(task) if isinstance(versions, Mapping) else None
+    claimed = task_version(run, task)
     now = task_spec(task).version
     if claimed != now:
         raise RecipeError(
