@@ -188,6 +188,8 @@ def change(content: dict[str, Any], path: str, value: object) -> dict[str, Any]:
         (robostats().replace('"task_id"', '"task"'), "task_id"),
         (openvla_oft().replace("# successes: 1 (33.3%)", "# successes: 2 (66.7%)"), "the episodes above it"),
         (openvla_oft().replace("Task: put the bowl away\n", ""), "below a task"),
+        (change(allenai(), "tasks", []), "no task with an episode"),
+        ("# episodes completed so far: 0", "no task with an episode"),
         ({"per_task": []}, "no known program"),
         ("nothing of the kind", "neither JSON nor a log"),
     ],

@@ -30,7 +30,10 @@ def read_imported(path: Path) -> tuple[ImportedRow, ...]:
         text = content.decode("utf-8")
     except UnicodeDecodeError as exc:
         raise source.refuse("bytes that are not UTF-8", exc) from exc
-    return _rows(text, source)
+    rows = _rows(text, source)
+    if not rows:
+        raise source.refuse("no task with an episode", "there is nothing to import")
+    return rows
 
 
 def _rows(text: str, source: Source) -> tuple[ImportedRow, ...]:
