@@ -1,4 +1,4 @@
-"""What an action means: the Panda's control modes, their numbers and bounds. Knows nothing of simulators.
+"""What an action means: control modes, their numbers and bounds; the Panda's. Knows nothing of simulators.
 
 Names, order and bounds are those of ManiSkill's controllers. The last number is the gripper in every mode:
 1 opens it, -1 closes it, and what is between is a width.
@@ -17,7 +17,7 @@ from vla_eval.specs import ActionSpec
 CONTROL_MODE = "control_mode"
 """Name of the argument in `env` that chooses one."""
 EE_DELTA_POSE = "pd_ee_delta_pose"
-"""The mode of an environment for which none is named."""
+"""The mode of an environment with the Panda for which none is named."""
 EE_DELTA_POS, EE_POSE = "pd_ee_delta_pos", "pd_ee_pose"
 JOINT_DELTA_POS, JOINT_POS = "pd_joint_delta_pos", "pd_joint_pos"
 ABSOLUTE_MODES = (JOINT_POS, EE_POSE)
@@ -49,6 +49,14 @@ def _delta(mode: str, dims: tuple[str, ...]) -> ActionSpec:
     return _spec(mode, dims, (-1.0,) * len(dims), (1.0,) * len(dims))
 
 
+def joint_modes(
+    joints: tuple[str, ...], low_rad: tuple[float, ...], high_rad: tuple[float, ...]
+) -> tuple[ActionSpec, ActionSpec]:
+    """Return what an action is in `pd_joint_delta_pos` and in `pd_joint_pos` of an arm with these joints."""
+    moved = tuple(f"{name}_delta" for name in joints)
+    return _delta(JOINT_DELTA_POS, moved), _spec(JOINT_POS, joints, low_rad, high_rad)
+
+
 _POSE_BOUNDS = (*(POSE_BOUND_M,) * 3, *(POSE_BOUND_RAD,) * 3)
 
 CONTROL_MODES: Mapping[str, ActionSpec] = MappingProxyType(
@@ -57,8 +65,7 @@ CONTROL_MODES: Mapping[str, ActionSpec] = MappingProxyType(
         for spec in (
             _delta(EE_DELTA_POSE, ("dx", "dy", "dz", "drx", "dry", "drz")),
             _delta(EE_DELTA_POS, ("dx", "dy", "dz")),
-            _delta(JOINT_DELTA_POS, tuple(f"{name}_delta" for name in ARM_JOINTS)),
-            _spec(JOINT_POS, ARM_JOINTS, JOINT_LOW_RAD, JOINT_HIGH_RAD),
+            *joint_modes(ARM_JOINTS, JOINT_LOW_RAD, JOINT_HIGH_RAD),
             _spec(
                 EE_POSE,
                 ("x", "y", "z", "rx", "ry", "rz"),
@@ -68,7 +75,8 @@ CONTROL_MODES: Mapping[str, ActionSpec] = MappingProxyType(
         )
     }
 )
-"""Mode -> its action. Positions in m and rotations in rad (XYZ Euler angles) in the frame of the base."""
+"""Mode -> its action with the Panda. Positions in m and rotations in rad (XYZ Euler angles) in the frame of
+the base."""
 
 RELATIVE_MODES = (EE_DELTA_POSE, EE_DELTA_POS, JOINT_DELTA_POS)
 """Modes whose actions are motions from where the arm is: one that is skipped is lost."""
@@ -79,8 +87,3 @@ def action_spec(mode: str) -> ActionSpec:
     if mode not in CONTROL_MODES:
         raise unknown_name("control mode", mode, CONTROL_MODES, where=f"env.{CONTROL_MODE}")
     return CONTROL_MODES[mode]
-
-
-def control_mode_of(env_kwargs: Mapping[str, object]) -> str:
-    """Return the mode that the arguments of a task name, or the default."""
-    return str(env_kwargs.get(CONTROL_MODE, EE_DELTA_POSE))

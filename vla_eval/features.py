@@ -13,6 +13,7 @@ import numpy as np
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
 from vla_eval.core import FloatArray, StepResult
 from vla_eval.errors import SpecMismatchError
+from vla_eval.robots.rows import PANDA
 from vla_eval.strict.bounds import Bounds, Steps, check_bounds
 
 MAX_CRF = 63  # of AV1; H.264 takes up to 51
@@ -38,7 +39,7 @@ PROPRIO_STATES = ("tcp_pose", "qpos", "qvel")
 """States of the environment that both are computed from; `joints` is all of them, one after the other."""
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
-JOINT_NAMES = (*(f"joint{i}" for i in range(1, 8)), "finger1", "finger2")  # of the Panda
+JOINT_NAMES = PANDA.joints
 ACTION_NAMES = CONTROL_MODES[EE_DELTA_POSE].dims
 STATE_NAMES: dict[StateKind, tuple[str, ...]] = {
     # The first two columns of the rotation matrix: no jumps, unlike roll-pitch-yaw, whose roll sits at
@@ -97,7 +98,7 @@ def proprioception(state: Mapping[str, FloatArray]) -> dict[StateKind, FloatArra
     if len(qpos) != len(JOINT_NAMES):
         raise SpecMismatchError(
             f"proprioception: expected the {len(JOINT_NAMES)} joints of the Panda, found {len(qpos)}. "
-            "Datasets and learned policies are the Panda's alone: leave env.robot_uids out."
+            "Datasets and learned policies are the Panda's alone: leave env.robot out."
         )
     columns = rotation_columns(pose[3:])
     width_m = qpos[-2:].sum(keepdims=True)

@@ -50,7 +50,10 @@ class ActionSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvSpec:
-    """All that one task offers to a policy; `is_instructed`: whether its episodes have an instruction."""
+    """All that one task offers to a policy.
+
+    `is_instructed`: whether its episodes have an instruction. `robot`: its name; None: the task has no robot.
+    """
 
     task: str
     cameras: tuple[CameraSpec, ...]
@@ -59,6 +62,7 @@ class EnvSpec:
     horizon_steps: int
     control_hz: float
     is_instructed: bool = True
+    robot: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,13 +16,12 @@ from vla_eval.policies.controls.scripted import make_oracle
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.arm import drives
-from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.testing.check_env import check_env
 
 TASK = "RememberColor3-v0"
 MODES = tuple(CONTROL_MODES)
-FETCH = {"robot_uids": FETCH_UID}
+FETCH = {"robot": "fetch"}
 BEFORE_THE_CHOICE = ("freeze_until_choice", "move_in_delay")
 
 

@@ -20,7 +20,9 @@ from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
 from vla_eval.config.protocol import Protocol
 from vla_eval.errors import RecipeError, some_of, unknown_name
 from vla_eval.evaluation.model_table import ModelTable
-from vla_eval.tasks.catalog import FAMILIES, TASKS, find_task, installed_tasks, task_spec
+from vla_eval.robots.find import robots
+from vla_eval.robots.rows import PANDA
+from vla_eval.tasks.catalog import FAMILIES, TASKS, family_of, find_task, installed_tasks, task_spec
 from vla_eval.tasks.source import TaskArgument, task_arguments
 from vla_eval.tasks.spec import PhaseSource, TaskSpec
 
@@ -85,12 +87,18 @@ def run(args: argparse.Namespace) -> int:
         "set in a configuration's `env:`, or by --set env.NAME=VALUE; `docs/tasks.md` explains them",
     )
     print(f"{'':{INDENT}}horizon_steps = {spec.horizon_steps}  (every task)")
+    print(f"{'':{INDENT}}robot = {PANDA.name!r}  (every task; {', '.join(_robots(spec))})")
     for argument in arguments.values():
         default = spec.kwargs.get(argument.name, argument.default)
         if argument.name in spec.open_arguments:
             default = "… (must be given)"
         print(f"{'':{INDENT}}{argument.name} = {default}  ({argument.origin})")
     return 0
+
+
+def _robots(spec: TaskSpec) -> list[str]:
+    """Return the names of the robots that solve a task."""
+    return [arm.name for arm in robots().values() if family_of(spec) not in arm.not_solved]
 
 
 def _show_folder(folder: Path) -> int:

@@ -7,7 +7,6 @@ from itertools import combinations
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar  # Any: plain data
 
-from vla_eval.control_modes import control_mode_of
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.manifest import (
     FETCH_AGAIN,
@@ -19,6 +18,7 @@ from vla_eval.data.manifest import (
     read_content,
 )
 from vla_eval.errors import DatasetError
+from vla_eval.robots.find import control_mode_of
 from vla_eval.seeding import SeedRange, seed_ranges
 from vla_eval.strict.json_text import Count, Positive, shown
 

@@ -23,10 +23,10 @@ from typing import Any
 
 import numpy as np
 
-from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.core import EpisodeStart, FloatArray
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.errors import DatasetError
+from vla_eval.robots.find import action_of
 from vla_eval.storage.durable import replace_file, whole_lines
 from vla_eval.strict.json_text import (
     Count,
@@ -100,7 +100,7 @@ class RecordedEpisode:
 
     @property
     def _n_action_dims(self) -> int:
-        return len(action_spec(control_mode_of(self.env_kwargs)).dims)
+        return len(action_of(self.env_kwargs).dims)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

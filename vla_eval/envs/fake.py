@@ -12,12 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.config.environment import AS_DESIGNED, HUMAN_CAMERA, EnvSettings
-from vla_eval.control_modes import CONTROL_MODE, control_mode_of
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.envs.official_settings import check_official
 from vla_eval.errors import TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.robots.find import control_mode_of
+from vla_eval.robots.rows import PANDA
 from vla_eval.specs import EnvSpec
 from vla_eval.task_state import BodyState, Phase, PrivilegedState, TaskStatus
 from vla_eval.tasks.arguments import check_argument, check_arguments
@@ -123,6 +125,7 @@ class FakeEnv:
             action=ACTION,
             horizon_steps=arguments.get("horizon_steps", task.default_horizon_steps(self._response_step)),
             control_hz=CONTROL_HZ,
+            robot=PANDA.name,
         )
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:

@@ -18,16 +18,17 @@ import numpy as np
 import torch
 
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
-from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
 from vla_eval.envs.scenes import CPU_RENDERER, build, describe, render_backend, take_human_image, take_images
 from vla_eval.envs.wrist_view import WristView
 from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.robots.find import ROBOT, ROBOT_UIDS, action_of, control_mode_of
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.appearance import with_appearance
-from vla_eval.tasks.arguments import ROBOT, check_arguments, horizon_steps, robot_uid
+from vla_eval.tasks.arguments import check_arguments, horizon_steps, robot_uid
 from vla_eval.tasks.arm.arm_control import drive_together
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import CAMERA_NAMES, CONTROL_HZ, IMAGE_SIZE, cameras, states
@@ -48,7 +49,7 @@ class ManiSkillEnv:
         kwargs = {**row.kwargs, **settings.kwargs}
         wanted_steps = kwargs.pop("horizon_steps", None)
         check_names("camera", settings.cameras, CAMERA_NAMES, where=row.id)
-        action = action_spec(control_mode_of(kwargs))
+        action = action_of(kwargs)
         self._settings = settings
         self._seeds = np.zeros(settings.n_slots, dtype=np.int64)
         batched = settings.sim_backend == "gpu"
@@ -63,6 +64,7 @@ class ManiSkillEnv:
             action=action,
             horizon_steps=horizon_steps(row, self._envs[0].longest_wait_steps(), wanted_steps),
             control_hz=CONTROL_HZ,
+            robot=self._envs[0].arm.name,
         )
         self.device = describe(self._envs[0], settings)
         # On a GPU, an image takes a hundredth of the time.
@@ -166,12 +168,13 @@ class ManiSkillEnv:
 
 def _build(cls: Any, settings: EnvSettings, kwargs: Mapping[str, Any], num_envs: int) -> Any:
     robot = robot_uid(kwargs, wrist_mesh=settings.render.wrist_mesh)
+    others = {name: value for name, value in kwargs.items() if name != ROBOT}
     return build(
         with_appearance(cls, settings.appearance),
         settings,
         num_envs=num_envs,
         sim_backend="physx_cuda" if settings.sim_backend == "gpu" else "physx_cpu",
-        **{**kwargs, ROBOT: robot, CONTROL_MODE: control_mode_of(kwargs)},
+        **{**others, ROBOT_UIDS: robot, CONTROL_MODE: control_mode_of(kwargs)},
     )
 
 

@@ -9,13 +9,15 @@ from contextlib import suppress
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 from vla_eval.config.environment import WristMesh
-from vla_eval.control_modes import CONTROL_MODE, action_spec, control_mode_of
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.errors import RecipeError, TaskArgumentError, check_names
 from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.robots.find import ROBOT, ROBOT_UIDS, action_of, control_mode_of, naming, robot_of, robots
+from vla_eval.robots.rows import PANDA
 from vla_eval.specs import EnvSpec
 from vla_eval.strict.decoding import check_value
-from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.arm.arms import WRIST_MESH_ROBOTS
+from vla_eval.tasks.catalog import TASKS, family_of
 from vla_eval.tasks.interface import CONTROL_HZ, IMAGE_SIZE, StepRange, cameras, states, step_range
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.limits import LIMITED, check_together, n_swaps
@@ -23,7 +25,8 @@ from vla_eval.tasks.source import class_constant, task_arguments
 from vla_eval.tasks.spec import TaskSpec, total_cue_steps
 
 HORIZON = "horizon_steps"
-ROBOT = "robot_uids"
+OF_EVERY_TASK: Mapping[str, str] = {HORIZON: "SomeSteps", ROBOT: "str", ROBOT_UIDS: "str"}
+"""Arguments that no class takes -> their annotation."""
 OWN = "vla_eval.tasks."
 """Classes of other packages may count otherwise which other cues there are."""
 CHOICE_ARGUMENTS = ("strict_choice", "show_cue", "cue_after_steps")
@@ -54,7 +57,7 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object]) -> None:
             f"{', '.join(of_choices)}: {spec.id}: there are no candidates to choose among. Use this task "
             f"without it, in a run of its own."
         )
-    action_spec(control_mode_of(given))
+    action_of(given)
     if spec.is_official:
         return
     _check_names_and_types(spec, given)
@@ -85,9 +88,10 @@ def _check_names_and_types(spec: TaskSpec, given: Mapping[str, object]) -> None:
     arguments = {argument.name: argument.annotation for argument in task_arguments(spec.entry_point)}
     if not arguments:  # a class of another package, made in a way that cannot be read
         return
-    check_names("argument", given, (HORIZON, *arguments), where=f"env of {spec.id}")
+    annotations = {**arguments, **OF_EVERY_TASK}
+    check_names("argument", given, annotations, where=f"env of {spec.id}")
     for name, value in given.items():
-        check_argument(_type_of(arguments.get(name, "SomeSteps")), value, name=name, task=spec.id)
+        check_argument(_type_of(annotations[name]), value, name=name, task=spec.id)
 
 
 def _type_of(annotation: str) -> Any:  # Any: a type annotation
@@ -113,32 +117,32 @@ def _with_usual(spec: TaskSpec, given: Mapping[str, object]) -> dict[str, Any]: 
 
 
 def _check_robot(spec: TaskSpec, given: Mapping[str, object]) -> None:
-    if ROBOT in given:
-        arms = (*WRIST_MESH_ROBOTS.values(), *spec.other_arms)
-        check_names("arm", [str(given[ROBOT])], arms, where=f"env.{ROBOT} of {spec.id}")
+    reason = robot_of(given).not_solved.get(family_of(spec))
+    if reason is not None:
+        solving = [arm.name for arm in robots().values() if family_of(spec) not in arm.not_solved]
+        raise TaskArgumentError(
+            f"{naming(given)}: this robot does not solve {spec.id}: {reason}. Robots that do: "
+            f"{', '.join(solving)}."
+        )
     robot_uid(given, wrist_mesh="shipped")
 
 
 def robot_uid(given: Mapping[str, object], *, wrist_mesh: WristMesh) -> str:
-    """Return the requested arm, or the Panda with the requested mesh.
+    """Return ManiSkill's name of the requested robot: of the Panda that with the requested mesh.
 
     Raises:
-        TaskArgumentError: the arm has no such mesh, or does not take the requested control mode.
+        TaskArgumentError: the robot has no such mesh, or one was chosen twice.
+        UnknownNameError: there is no such robot.
     """
-    if ROBOT not in given:
+    arm = robot_of(given)
+    if arm is PANDA and ROBOT_UIDS not in given:
         return WRIST_MESH_ROBOTS[wrist_mesh]
-    robot, mode = str(given[ROBOT]), control_mode_of(given)
-    if wrist_mesh != "shipped" or robot in WRIST_MESH_ROBOTS.values():
+    if wrist_mesh != "shipped" or arm is PANDA:
         raise TaskArgumentError(
-            f"{ROBOT}={robot!r} with render.wrist_mesh={wrist_mesh!r}: the mesh belongs to the Panda, the "
+            f"{naming(given)} with render.wrist_mesh={wrist_mesh!r}: the mesh belongs to the Panda, the "
             "default arm. Set only one of the two."
         )
-    if robot in ARMS and mode not in ARMS[robot].control_modes:
-        raise TaskArgumentError(
-            f"{CONTROL_MODE}={mode!r} with {ROBOT}={robot!r}: this arm takes "
-            f"{', '.join(ARMS[robot].control_modes)}. Leave one of the two out."
-        )
-    return robot
+    return arm.uids[0]
 
 
 def longest_wait_steps(spec: TaskSpec, given: Mapping[str, object]) -> int:
@@ -178,19 +182,20 @@ def offered_by(spec: TaskSpec, given: Mapping[str, object]) -> EnvSpec:
 
     Raises:
         TaskArgumentError: the arguments are impossible.
-        UnknownNameError: there is no such control mode.
+        UnknownNameError: there is no such control mode or robot.
     """
     size_px = given.get(IMAGE_SIZE)
-    arm = ARMS.get(str(given.get(ROBOT)), ARMS[WRIST_MESH_ROBOTS["shipped"]])
+    arm = robot_of(given)
     prompt_dims = None if spec.is_official else class_constant(spec.entry_point, "PROMPT_DIMS")
     wait = 0 if spec.is_official else longest_wait_steps(spec, given)
     return EnvSpec(
         task=spec.id,
         cameras=cameras(size_px if isinstance(size_px, int) else IMAGE_SIZE_PX),
         states=states(arm.joints, prompt_dims if isinstance(prompt_dims, tuple) else ()),
-        action=action_spec(control_mode_of(given)),
+        action=action_of(given),
         horizon_steps=horizon_steps(spec, wait, given.get(HORIZON)),
         control_hz=CONTROL_HZ,
+        robot=arm.name,
     )
 
 

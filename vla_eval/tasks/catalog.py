@@ -13,7 +13,6 @@ from typing import get_args
 
 from vla_eval.base_tasks.row import NAMESPACE as NAMESPACE_BASE
 from vla_eval.errors import PluginError, TaskArgumentError, UnknownNameError, unknown_name
-from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.catalogs.base_catalog import MIKASA_BASE
 from vla_eval.tasks.catalogs.official_catalog import (
     MIKASA_VLA_90,
@@ -23,7 +22,7 @@ from vla_eval.tasks.catalogs.official_catalog import (
 )
 from vla_eval.tasks.catalogs.sequence_catalog import SEQUENCE_TASKS
 from vla_eval.tasks.catalogs.spatial_catalog import SPATIAL_TASKS
-from vla_eval.tasks.families import make_families
+from vla_eval.tasks.families import FAMILY_TABLE, make_families
 from vla_eval.tasks.spec import Suite, TaskSpec
 
 TASK_GROUP = "vla_eval.tasks"
@@ -49,7 +48,6 @@ def _remember(
         candidates="items",
         candidate_counts=kwargs,
         chance_success=1 / math.prod(kwargs.values()),
-        other_arms=(FETCH_UID,),
         suite=suite,
     )
 
@@ -196,6 +194,14 @@ def find_task(task_id: str) -> TaskSpec | None:
     """
     name = task_id.removeprefix("vla_eval/")
     return _own(name) or installed_tasks().get(name) or _own(with_version(name))
+
+
+_FAMILY_OF = {TASKS[family.row].instruction_key: family.id for family in FAMILY_TABLE}
+
+
+def family_of(spec: TaskSpec) -> str:
+    """Return the id of the family that a task belongs to; its own id if it belongs to none."""
+    return _FAMILY_OF.get(spec.instruction_key, spec.id) if spec.id in (*TASKS, *FAMILIES) else spec.id
 
 
 def with_version(task_id: str) -> str:

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from vla_eval.control_modes import EE_DELTA_POSE, action_spec
+from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE, action_spec
 from vla_eval.errors import TaskArgumentError
 from vla_eval.features import IMAGE_SIZE_PX, JOINT_NAMES, POSE_NAMES
+from vla_eval.robots.find import ROBOT, action_of, robot_named
+from vla_eval.robots.rows import PANDA
 from vla_eval.specs import CameraSpec, EnvSpec, StateSpec
 from vla_eval.strict.bounds import MAX_STEPS
 
@@ -66,17 +68,21 @@ def states(joints: tuple[str, ...] = JOINT_NAMES, prompt_dims: tuple[str, ...] =
     return (*offered, StateSpec(name="task_cue", dims=prompt_dims, unit="rad", frame="world"))
 
 
-def env_spec(*, control_mode: str = EE_DELTA_POSE, image_size_px: int = IMAGE_SIZE_PX) -> EnvSpec:
-    """Return what all tasks have in common with the Panda, with an episode of one step.
+def env_spec(
+    *, control_mode: str = EE_DELTA_POSE, image_size_px: int = IMAGE_SIZE_PX, robot: str = PANDA.name
+) -> EnvSpec:
+    """Return what all tasks have in common with a robot, with an episode of one step.
 
     Raises:
-        UnknownNameError: there is no such control mode.
+        UnknownNameError: there is no such control mode or robot.
+        TaskArgumentError: the robot does not have the control mode.
     """
     return EnvSpec(
         task=ANY_TASK,
         cameras=cameras(image_size_px),
-        states=states(),
-        action=action_spec(control_mode),
+        states=states(robot_named(robot).joints),
+        action=action_of({ROBOT: robot, CONTROL_MODE: control_mode}),
         horizon_steps=1,
         control_hz=CONTROL_HZ,
+        robot=robot,
     )

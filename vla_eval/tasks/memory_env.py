@@ -8,6 +8,8 @@ of a control step. Tensors are made only for those who step ManiSkill's environm
 """
 
 import functools
+import importlib
+import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -22,12 +24,11 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import unknown_name
 from vla_eval.features import IMAGE_SIZE_PX
+from vla_eval.robots.arm import Arm
+from vla_eval.robots.find import robot_with_uid
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
-from vla_eval.tasks.arm import fetch, robots  # noqa: F401  importing them registers the arms
-from vla_eval.tasks.arm.arms import ARMS, WRIST_MESH_ROBOTS, Arm
 from vla_eval.tasks.arm.robots import ParsedArms, kept_loader
 from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, step_range
 from vla_eval.tasks.objects import limits
@@ -81,11 +82,9 @@ class MemoryTableEnv(TensorsOut):
         control_mode: what an action means, see `control_modes`. None: ManiSkill's default for the arm.
         image_size: height and width of the images of both cameras, pixels.
         robot_uids: `panda_wristcam`; `panda_wristcam_seen`, which gives the same images faster;
-            `panda_wristcam_light` with a simplified camera mesh; or another arm that the task supports
-            (`SUPPORTED_ROBOTS`).
+            `panda_wristcam_light` with a simplified camera mesh; or that of another robot.
     """
 
-    SUPPORTED_ROBOTS: tuple[str, ...] = tuple(WRIST_MESH_ROBOTS.values())
     SUPPORTED_REWARD_MODES = ("normalized_dense", "dense", "sparse", "none")
     FAMILY: int
     """Number of the task family in random streams. Part of every result: never renumber, only add."""
@@ -126,9 +125,8 @@ class MemoryTableEnv(TensorsOut):
         self.phase_gate_success = phase_gate_success
         self.static_threshold_rad_s = static_threshold_rad_s
         self.instruction = instruction
-        if robot_uids not in self.SUPPORTED_ROBOTS:
-            raise unknown_name("robot_uids", robot_uids, self.SUPPORTED_ROBOTS, where=type(self).__name__)
-        self.arm: Arm = ARMS[robot_uids]
+        self.arm: Arm = robot_with_uid(robot_uids, where=f"robot_uids of {type(self).__name__}")
+        importlib.import_module(self.arm.agent.partition(":")[0])  # registers it with ManiSkill
         limits.check(Positive, static_threshold_rad_s=static_threshold_rad_s)
         self._parsed_arms: ParsedArms = {}
         # Without it an unseeded reset would repeat the last episode: ManiSkill then keeps the old seed.
@@ -174,7 +172,11 @@ class MemoryTableEnv(TensorsOut):
 
     def _load_agent(self, options: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         self.scene.create_urdf_loader = functools.partial(kept_loader, self.scene, self._parsed_arms)
-        super()._load_agent(options, sapien.Pose(p=self.arm.base_m))
+        super()._load_agent(options, self._base_pose())
+
+    def _base_pose(self) -> sapien.Pose:
+        half_rad = self.arm.base_yaw_rad / 2
+        return sapien.Pose(self.arm.base_m, [math.cos(half_rad), 0, 0, math.sin(half_rad)])
 
     def close(self) -> None:
         """Release the simulator, and with it the renderer: what is kept of the arm has materials."""
@@ -210,7 +212,7 @@ class MemoryTableEnv(TensorsOut):
             delay = int(phases.integers(*self.delay_steps_range, endpoint=True))
             self._response_step[env] = self._cue_end_step[env] + delay
         self.agent.reset(qpos.astype(np.float32))
-        self.agent.robot.set_pose(sapien.Pose(arm.base_m))
+        self.agent.robot.set_pose(self._base_pose())
         for env in env_idx.tolist():
             self._sample_episode(env)
         mask = np.zeros(self.num_envs, dtype=np.bool_)

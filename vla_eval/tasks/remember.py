@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.seeding import Stream
-from vla_eval.tasks.arm.arms import FETCH_UID
 from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere
@@ -54,7 +53,6 @@ class RememberEnv(ItemChoiceEnv):
     Version history: 1, first version.
     """
 
-    SUPPORTED_ROBOTS = (*ItemChoiceEnv.SUPPORTED_ROBOTS, FETCH_UID)
     MAX_REWARD = 3.0
     REACH_SCALE_PER_M = 10.0
     SLOWING_WEIGHT = 0.5

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 SIMULATOR = "mani_skill"  # to look for one of its modules would import it
-NOT_FOR_USERS = ("instruction", "reconfiguration_freq")  # chosen by other options or not at all
+# Chosen by other options (the robot by one of every task), or not at all.
+NOT_FOR_USERS = ("instruction", "reconfiguration_freq", "robot_uids")
 
 
 class TaskArgument(NamedTuple):

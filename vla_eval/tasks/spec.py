@@ -73,7 +73,6 @@ class TaskSpec:
     idle_success: float = 0.0  # measured success rate of doing nothing; 0 for all tasks but a few
     cue_marks_place: bool = False  # the cue is shown where the right candidate will be
     shows_one_by_one: bool = False  # the cue is `n_shown` items one after another, each for `cue_steps`
-    other_arms: tuple[str, ...] = ()  # values of `robot_uids` that it takes in addition to the Panda's
     # arguments required to make a task of this row; empty except for a family
     open_arguments: tuple[str, ...] = ()
     is_slow: bool = False  # 100 episodes take an hour: a run of its whole suite leaves it out, and says so

@@ -17,12 +17,13 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.config.prompts import instruction_for
-from vla_eval.control_modes import CONTROL_MODE, control_mode_of
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import EvaluationObserver, evaluate
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import mean_return, wilson_interval
+from vla_eval.robots.find import control_mode_of
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec

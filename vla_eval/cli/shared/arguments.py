@@ -121,7 +121,7 @@ def env_paths(overrides: Sequence[str]) -> dict[str, list[str]]:
     from vla_eval.tasks.source import task_arguments
 
     names = [
-        "horizon_steps",
+        *("horizon_steps", "robot"),
         *(one.name for task in TASKS.values() for one in task_arguments(task.entry_point)),
     ]
     return {name: [f"env.{name}"] for name in names}

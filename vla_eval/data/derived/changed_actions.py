@@ -12,7 +12,6 @@ import pyarrow.parquet as pq
 
 from vla_eval.config.dataset import OPTION_FIELDS, DatasetRecipe, fingerprint
 from vla_eval.config.files import content_of
-from vla_eval.control_modes import action_spec, control_mode_of
 from vla_eval.core import FloatArray
 from vla_eval.data.dataset_folder import check_dataset, digest_files
 from vla_eval.data.exact_statistics import vector_statistics
@@ -33,6 +32,7 @@ from vla_eval.data.recording.worker import stored_actions
 from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES, read_table
 from vla_eval.errors import DatasetError
 from vla_eval.features import ACTION_KEY
+from vla_eval.robots.find import action_of
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 
 
@@ -66,7 +66,7 @@ def copy_with_actions(
 
 def _replace_actions(root: Path, actions: Sequence[FloatArray], recipe: DatasetRecipe) -> None:
     """Replace the field `action` of a LeRobotDataset: rows, statistics, and their description."""
-    names = list(action_spec(control_mode_of(recipe.env)).dims)
+    names = list(action_of(recipe.env).dims)
     info = json.loads((root / INFO_FILE).read_text(encoding="utf-8"))
     info["features"][ACTION_KEY] |= {"shape": [len(names)], "names": names}
     _write_json(root / INFO_FILE, info)

@@ -16,6 +16,8 @@ from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import gripper_command
 from vla_eval.oracles.translation import translated
 from vla_eval.policies.context import PolicyContext
+from vla_eval.robots.arm import Arm
+from vla_eval.robots.find import robot_named
 from vla_eval.seeding import Stream, generator
 from vla_eval.specs import PolicySpec
 from vla_eval.task_state import PrivilegedState
@@ -52,6 +54,13 @@ def task_expert(context: PolicyContext) -> Any:  # Any: each family's experts ha
     return getattr(importlib.import_module(module), name)
 
 
+def arm_of(context: PolicyContext) -> Arm:
+    """Return the robot of the context's environment; raise `SpecMismatchError` if it has none."""
+    robot = context.env.robot
+    check_has(robot is not None, context, "moves a robot", "has none")
+    return robot_named(str(robot))
+
+
 class ScriptedPolicy:
     """What all controls share: their spec, and one random generator per running episode."""
 
@@ -72,6 +81,11 @@ class ScriptedPolicy:
             chunk_size=self._n_actions,
             privileged=self.privileged,
         )
+
+    @property
+    def arm(self) -> Arm:
+        """The robot of the environment."""
+        return arm_of(self._context)
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
         """Seed each episode's generator by its task, seed and run."""

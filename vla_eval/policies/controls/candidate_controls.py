@@ -89,7 +89,8 @@ class ChoicePolicy(_CandidateArm[CandidateExpert]):
         return order[0]
 
     def _touches(self, window: ObservationWindow, state: PrivilegedState, candidate: int) -> bool:
-        at_rest = bool(np.abs(window.last.state["qvel"][:-2]).max() <= STATIC_RAD_S)
+        qvel = window.last.state["qvel"][list(self.arm.arm_joints)]
+        at_rest = bool(np.abs(qvel).max() <= STATIC_RAD_S)
         return at_rest and self._expert.is_done(state, candidate)
 
 

@@ -59,7 +59,7 @@ class HoldPolicy(ScriptedPolicy):
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Hold for a chunk."""
-        width_m = float(window.last.state["qpos"][-2:].sum())
+        width_m = float(self.arm.gripper.width_m(window.last.state["qpos"]))
         return ActionChunk(actions=hold_rows(width_m, self._n_actions, self._n_dims))
 
 

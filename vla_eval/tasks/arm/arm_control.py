@@ -16,7 +16,7 @@ from mani_skill.utils.sapien_utils import get_pairwise_contacts
 from vla_eval.control_modes import ABSOLUTE_MODES, EE_POSE, JOINT_POS
 from vla_eval.core import FloatArray
 from vla_eval.errors import TaskArgumentError
-from vla_eval.tasks.arm.arms import Arm
+from vla_eval.robots.arm import Arm
 from vla_eval.tasks.arm.drives import Drive, drives_of
 from vla_eval.tasks.arm.interference import GRIPPER_DIMENSION, Y_DIMENSION, delay_motion
 from vla_eval.tasks.objects.bodies import (
@@ -83,8 +83,7 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
 
     def gripper_width_m(self) -> FloatArray:
         """Return the (B,) gap between the fingers."""
-        qpos = self.qpos()
-        return qpos[:, -2] + qpos[:, -1]
+        return self.arm.gripper.width_m(self.qpos())
 
     def arm_qvel(self) -> FloatArray:
         """Return the (B, J) velocities of the joints that move the hand, rad/s."""
@@ -137,10 +136,10 @@ class ArmControl(BaseEnv):  # type: ignore[misc]  # ManiSkill is untyped
             raise TaskArgumentError(
                 f"control_mode={self.control_mode!r}: no action of this mode holds the arm still."
             )
-        gripper = self.agent.controller.controllers["gripper"]
-        low, high = gripper.config.lower, gripper.config.upper
-        width = self.gripper_width_m() / 2
-        action[:, -1] = ((width - low) / (high - low) * 2 - 1).clip(-1, 1)
+        gripper = self.arm.gripper
+        low, high = gripper.closed, gripper.opened
+        position = gripper.position(self.qpos())
+        action[:, -1] = ((position - low) / (high - low) * 2 - 1).clip(-1, 1)
         return action
 
     def joint_targets(self) -> FloatArray:

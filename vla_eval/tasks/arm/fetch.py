@@ -12,7 +12,7 @@ from mani_skill.agents.robots.fetch import Fetch
 from mani_skill.sensors.camera import CameraConfig
 
 from vla_eval.features import IMAGE_SIZE_PX
-from vla_eval.tasks.arm.arms import FETCH_UID
+from vla_eval.robots.rows import FETCH
 from vla_eval.tasks.interface import CAMERA_FOV_RAD
 
 HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint with this damping does not move by itself
@@ -35,7 +35,7 @@ class _StillConfig(PassiveControllerConfig):  # type: ignore[misc]  # ManiSkill 
 class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
     """ManiSkill's Fetch, standing still in front of the table: only its arm and gripper are commanded."""
 
-    uid = FETCH_UID
+    (uid,) = FETCH.uids
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
