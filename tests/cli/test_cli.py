@@ -99,7 +99,7 @@ class TestMistakes:
         )
 
     def test_a_list_of_what_there_is_not(self, capsys: pytest.CaptureFixture[str]) -> None:
-        assert "invalid choice: 'robots'" in mistake(capsys, "list", "robots")
+        assert "invalid choice: 'robot'" in mistake(capsys, "list", "robot")
 
     def test_an_interrupt_has_the_shell_s_exit_code(
         self, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

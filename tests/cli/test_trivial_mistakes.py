@@ -17,8 +17,8 @@ WRONG_ENV = {
     "--set env.delay_steps=long": "delay_steps",
     "--set env.horizon_steps=8": "no step is left for the choice",
     "--set env.control_mode=pd_ee": "Did you mean 'pd_ee_",
-    "--set env.robot=ftech": "Did you mean 'fetch'",
-    "--set env.robot=fetch --set env.control_mode=pd_ee_pose": "this arm takes pd_ee_delta_pose",
+    "--set env.robot=so10": "Did you mean 'so100'",
+    "--set env.robot=so100 --set env.control_mode=pd_ee_pose": "this arm takes pd_joint_pos",
 }
 HEAVY = (*("torch", "lerobot", "transformers", "datasets", "mani_skill", "sapien", "cv2", "rerun"),)
 MOST_CPU_SECONDS = 2.0

@@ -7,6 +7,7 @@ import pytest
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings, RenderSettings
+from vla_eval.control_modes import JOINT_DELTA_POS
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameError
@@ -15,9 +16,10 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_oracle
 from vla_eval.robots.arm import Arm
 from vla_eval.robots.rows import FETCH as FETCH_ROW
-from vla_eval.robots.rows import PANDA, ROWS
+from vla_eval.robots.rows import KOCH, PANDA, ROWS, SO100
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.catalog import TASKS, family_of, task_spec
+from vla_eval.testing.check_env import check_env
 
 TASK = "RememberColor3-v0"
 FETCH = {"robot": "fetch"}
@@ -48,6 +50,18 @@ def test_the_expert_touches_the_right_cube_with_every_robot(arm: Arm, n_action_s
     env = env_with(kwargs={"robot": arm.name}, privileged=True)
     for seed in (1, 2, 3):
         assert solve(env, TASK, seed, n_action_steps=n_action_steps) == "success", seed
+
+
+@pytest.mark.parametrize("arm", [SO100, KOCH], ids=lambda arm: arm.name)
+def test_the_expert_touches_the_right_cube_by_motions_of_the_joints(arm: Arm) -> None:
+    env = env_with(kwargs={"robot": arm.name, "control_mode": JOINT_DELTA_POS}, privileged=True)
+    assert solve(env, TASK, 1, n_action_steps=1) == "success"
+
+
+@pytest.mark.parametrize("task", ["ShellGameTouch-v0", "TakeItBack-v0"])
+def test_the_so100_touches_mugs_and_carries_a_cube(task: str) -> None:
+    env = env_with(task=task, kwargs={"robot": "so100"}, privileged=True)
+    assert [solve(env, task, seed, n_action_steps=1) for seed in (1, 2)] == ["success", "success"]
 
 
 @pytest.mark.slow
@@ -82,6 +96,11 @@ def test_names_and_bounds_are_those_of_the_simulator_in_every_mode(arm: Arm) -> 
         assert [joint.name for joint in robot.active_joints][-1] == arm.joints[-1] or arm is FETCH_ROW
         assert robot.max_dof == len(arm.joints)
         env.close()
+
+
+@pytest.mark.parametrize("arm", [SO100, KOCH], ids=lambda arm: arm.name)
+def test_a_small_arm_keeps_the_contract_of_an_environment(arm: Arm) -> None:
+    check_env(lambda: env_with(kwargs={"robot": arm.name}, privileged=True), renders=False, n_steps=4)
 
 
 @every_other

@@ -1,4 +1,4 @@
-"""`mikasa-vla list`: which tasks, families, policies, configs, prompts, datasets, protocols there are."""
+"""`mikasa-vla list`: tasks, families, robots, policies, configs, prompts, datasets and protocols."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -20,6 +20,8 @@ from vla_eval.errors import PluginError, RecipeError, VlaEvalError
 from vla_eval.evaluation.model_table import ModelTable
 from vla_eval.policies.registry import policy_adapters
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.robots.find import robots
+from vla_eval.robots.rows import ROWS
 from vla_eval.tasks.catalog import FAMILIES, SUITES, installed_tasks
 from vla_eval.tasks.spec import MemoryType, Suite, TaskSpec
 
@@ -110,6 +112,16 @@ def _task(spec: TaskSpec) -> Row:
     return (*cells, *chance, f"“{instruction_for(spec)}”")
 
 
+def _robots() -> Groups:
+    broken = []
+    try:
+        arms = tuple(robots().values())
+    except PluginError as exc:
+        arms, broken = ROWS, [(OF_PACKAGES, "", _broken("", exc)[-1])]
+    rows = [(arm.name, ", ".join(arm.actions), arm.description) for arm in arms]
+    return {UNGROUPED: rows, BROKEN: broken}
+
+
 def _families() -> Groups:
     rows: list[Row] = []
     for spec in FAMILIES.values():
@@ -165,6 +177,7 @@ def _broken(name: str, exc: VlaEvalError) -> Row:
 _LISTS: dict[str, Callable[[], Groups]] = {
     "tasks": _tasks,
     "families": _families,
+    "robots": _robots,
     "policies": _policies,
     "configs": lambda: _recipes("configs", config_class),
     "prompts": lambda: _recipes("prompts", lambda _name: PromptRecipe),

@@ -37,7 +37,7 @@ VERBS: Mapping[str, str] = {
     "train-agent": "train an agent by rewards, or resume the training",
     "checkpoint": "check a checkpoint, or convert an original one",
     "serve": "serve a policy to simulators and other clients over WebSocket",
-    "list": "list tasks, families, policies, configs, prompts, datasets, protocols",
+    "list": "list tasks, families, robots, policies, configs, prompts, datasets, protocols",
     "show": "explain a task, policy, configuration, dataset, protocol or folder",
     "doctor": "check this machine and say what to do",
     "bench": "measure rendering, loading or serving, as ratios from one run",

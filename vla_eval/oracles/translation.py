@@ -56,7 +56,7 @@ def command(mode: str, target_rad: Vector, gripper: float, qpos: Vector) -> NDAr
     if mode == JOINT_POS:
         arm = target_rad
     elif mode == JOINT_DELTA_POS:
-        arm = _within_bounds((target_rad - qpos[:N_ARM_JOINTS]) / DELTA_RAD)
+        arm = within_bounds((target_rad - qpos[:N_ARM_JOINTS]) / DELTA_RAD)
     else:
         arm = _tool_command(mode, target_rad, qpos)
     return np.array([*arm, gripper], dtype=np.float32)
@@ -67,7 +67,7 @@ def _tool_command(mode: str, target_rad: Vector, qpos: Vector) -> Vector:
     if mode == EE_POSE:
         return np.concatenate([target[:3, 3], to_euler_xyz(target[:3, :3])])
     now = tool_pose(qpos)
-    way = _within_bounds((target[:3, 3] - now[:3, 3]) / DELTA_M)
+    way = within_bounds((target[:3, 3] - now[:3, 3]) / DELTA_M)
     if mode == EE_DELTA_POS:
         return way
     return np.concatenate([way, to_euler_xyz(target[:3, :3] @ now[:3, :3].T) / -DELTA_RAD])
@@ -92,6 +92,6 @@ def translated(rows: NDArray[np.float32], mode: str, qpos: Vector, qvel: Vector)
     return np.stack(actions)
 
 
-def _within_bounds(numbers: Vector) -> Vector:
+def within_bounds(numbers: Vector) -> Vector:
     """Return numbers in [-1, 1] in the same direction."""
     return numbers / max(float(np.abs(numbers).max()), 1.0)

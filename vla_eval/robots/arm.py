@@ -51,6 +51,29 @@ class Gripper:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Hinge:
+    """A joint of a chain as a URDF describes it, in the frame of the one before."""
+
+    origin_m: Xyz
+    rpy_rad: Xyz = (0.0, 0.0, 0.0)
+    axis: Xyz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chain:
+    """The joints from the root to the hand, and the tool centre point at its end.
+
+    The tool's z points along the fingers, its y from one to the other.
+    """
+
+    hinges: tuple[Hinge, ...]
+    tool: Hinge  # fixed: its axis is not used
+    low_rad: tuple[float, ...]
+    high_rad: tuple[float, ...]
+    least_reach_m: float  # nearer to the first hinge's axis, which is vertical, the hand has to turn about it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Arm:
     """A robot at the table."""
 
@@ -69,5 +92,7 @@ class Arm:
     base_yaw_rad: float = 0.0  # and how far it is turned about the vertical
     # control mode -> what an action is; the first is the one of an environment for which none is named
     actions: Mapping[str, ActionSpec]
+    # for an arm without a control mode of the hand's pose: what scripted controls need to move its joints
+    chain: Chain | None = None
     # family of tasks -> why the arm does not solve it, in words: it is not offered there
     not_solved: Mapping[str, str] = field(default_factory=dict)

@@ -2,8 +2,9 @@
 
 import numpy as np
 
-from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
-from vla_eval.robots.arm import Arm, Gripper
+from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE, JOINT_DELTA_POS, JOINT_POS, joint_modes
+from vla_eval.robots.arm import Arm, Chain, Gripper, Hinge
+from vla_eval.specs import ActionSpec
 
 # Arm of the official code (mikasa_tasks section 1): tool centre point at (-0.07, 0, 0.318), pointing down.
 PANDA = Arm(
@@ -53,5 +54,121 @@ FETCH = Arm(
     },
 )
 
-ROWS = (PANDA, FETCH)
+
+def _five_joints(joints: tuple[str, ...], chain: Chain) -> dict[str, ActionSpec]:
+    """Return the control modes of an arm with too few joints for every pose of the hand.
+
+    Absolute positions come first, as LeRobot commands these arms.
+    """
+    delta, absolute = joint_modes(joints[:-1], chain.low_rad, chain.high_rad)
+    return {JOINT_POS: absolute, JOINT_DELTA_POS: delta}
+
+
+_BEHIND_THE_MUGS = "the mugs are pushed from behind, and behind the nearest ones the arm itself stands"
+_IN_THE_LANE = dict.fromkeys(
+    ("Intercept", "InterceptGrab"), "many balls roll through the place where the arm stands"
+)
+_QUARTER = np.pi / 2
+_SO100_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
+# Of ManiSkill's `so100.urdf`. The tool centre point is 3 cm in front of the fixed jaw's tip: the jaws then
+# pass a cube of 4 cm and a peg of 5 cm on both sides.
+_SO100_CHAIN = Chain(
+    hinges=(
+        Hinge(origin_m=(0.0, -0.0452, 0.0165), rpy_rad=(1.5708, 0.0, 0.0), axis=(0.0, -1.0, 0.0)),
+        Hinge(origin_m=(0.0, 0.1025, 0.0306), axis=(1.0, 0.0, 0.0)),
+        Hinge(origin_m=(0.0, 0.11257, 0.028), axis=(1.0, 0.0, 0.0)),
+        Hinge(origin_m=(0.0, 0.0052, 0.1349), rpy_rad=(-1.5708, 0.0, 0.0), axis=(1.0, 0.0, 0.0)),
+        Hinge(origin_m=(0.0, -0.0601, 0.0), rpy_rad=(0.0, 1.5708, 0.0), axis=(0.0, 1.0, 0.0)),
+    ),
+    tool=Hinge(origin_m=(-0.02, -0.097, 0.0), rpy_rad=(_QUARTER, _QUARTER, 0.0), axis=(0.0, 0.0, 1.0)),
+    low_rad=(-2.0, -1.5708, -1.5708, -1.8, -3.14159),
+    high_rad=(2.0, 1.5708, 1.5708, 1.8, 3.14159),
+    least_reach_m=0.1,
+)
+# So far back that the nearest mugs do not stand on it, and so near that it reaches the farthest.
+SO100 = Arm(
+    name="so100",
+    agent="vla_eval.tasks.arm.small_arms:SO100AtTable",
+    uids=("so100_at_table",),
+    description="SO-100, LeRobot's arm with five joints and a gripper, on the table",
+    joints=_SO100_JOINTS,
+    arm_joints=tuple(range(5)),
+    # Up to 5 cm as measured with cubes between the jaws, beyond that the distance of the jaws' tips in the
+    # same file less 12 mm.
+    gripper=Gripper(
+        joints=(-1,),
+        closed=-1.1,
+        opened=1.1,
+        gaps_m=(
+            *((-1.1, 0.0), (-0.92, 0.018), (-0.76, 0.027), (-0.5, 0.04)),
+            *((-0.27, 0.05), (0.0, 0.07), (0.5, 0.1), (1.1, 0.126)),
+        ),
+    ),
+    rest_qpos=(0.0, -0.8, 0.2, 1.75, _QUARTER, -0.05),
+    base_m=(-0.24, 0.0, 0.0),
+    base_yaw_rad=_QUARTER,
+    actions=_five_joints(_SO100_JOINTS, _SO100_CHAIN),
+    chain=_SO100_CHAIN,
+    not_solved={
+        "ShellGamePush": _BEHIND_THE_MUGS,
+        "ShellGamePick": "its jaws, one of which swings, push the mug away instead of closing on the handle",
+        **_IN_THE_LANE,
+        **dict.fromkeys(
+            ("RotateLenient", "RotateStrict"), "it does not come to rest while its jaws hold the peg"
+        ),
+    },
+)
+
+_KOCH_JOINTS = (*(f"joint_{i}" for i in range(1, 6)), "joint_6")
+# Of ManiSkill's `follower_arm_v1.1.urdf`. The tool centre point is 2 cm in front of the fixed finger's tip.
+_KOCH_CHAIN = Chain(
+    hinges=(
+        Hinge(origin_m=(0.0005, -0.067858, 0.041066), axis=(0.0, 0.0, -1.0)),
+        Hinge(origin_m=(0.020713, 0.0, 0.015368), rpy_rad=(1.5707963, 0.0, 0.0), axis=(-1.0, 0.0, 0.0)),
+        Hinge(
+            origin_m=(-0.038026, -0.014951, 0.108424), rpy_rad=(-1.5707963, 0.0, 0.0), axis=(1.0, 0.0, 0.0)
+        ),
+        Hinge(
+            origin_m=(-0.000251, -0.100502, 0.002641), rpy_rad=(-1.5707963, 0.0, 0.0), axis=(1.0, 0.0, 0.0)
+        ),
+        Hinge(origin_m=(0.019234, 0.00037, -0.044779), rpy_rad=(0.0, 0.0, -1.5707963), axis=(0.0, 0.0, -1.0)),
+    ),
+    tool=Hinge(origin_m=(0.012, 0.0, -0.065), rpy_rad=(np.pi, 0.0, _QUARTER), axis=(0.0, 0.0, 1.0)),
+    low_rad=(-3.14159, 0.0, 0.0, -1.5, -3.14159),
+    high_rad=(3.14159, 2.2, 3.05, 2.14159, 3.14159),
+    least_reach_m=0.1,
+)
+# So far back that the outermost of nine cubes do not stand beside it.
+KOCH = Arm(
+    name="koch",
+    agent="vla_eval.tasks.arm.small_arms:KochAtTable",
+    uids=("koch_at_table",),
+    description="Koch v1.1, the smaller arm with five joints and a gripper, on the table",
+    joints=_KOCH_JOINTS,
+    arm_joints=tuple(range(5)),
+    # The distance of the fingers' tips in the same file.
+    gripper=Gripper(
+        joints=(-1,),
+        closed=0.0,
+        opened=1.6,
+        gaps_m=(
+            *((0.0, 0.0), (0.2, 0.0125), (0.4, 0.023), (0.6, 0.0333)),
+            *((0.8, 0.0433), (1.2, 0.0619), (1.6, 0.078)),
+        ),
+    ),
+    rest_qpos=(0.0, 1.35, 0.5, 2.1, _QUARTER, 1.6),
+    base_m=(-0.25, 0.0, 0.0),
+    base_yaw_rad=_QUARTER,
+    actions=_five_joints(_KOCH_JOINTS, _KOCH_CHAIN),
+    chain=_KOCH_CHAIN,
+    not_solved={
+        "ShellGamePush": _BEHIND_THE_MUGS,
+        "ShellGamePick": "its fingers, one of which swings, do not close on the handle",
+        **_IN_THE_LANE,
+        **dict.fromkeys(("RotateLenient", "RotateStrict"), "its fingers do not get around the peg"),
+        "TakeItBack": "its fingers lose the cube on the way",
+    },
+)
+
+ROWS = (PANDA, FETCH, SO100, KOCH)
 """In the order in which they are listed."""

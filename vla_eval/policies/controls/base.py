@@ -14,6 +14,7 @@ from vla_eval.control_modes import EE_DELTA_POS, EE_DELTA_POSE, action_spec
 from vla_eval.core import ActionChunk, EpisodeStart, ObservationWindow
 from vla_eval.errors import SpecMismatchError
 from vla_eval.oracles.arm_model import gripper_command
+from vla_eval.oracles.joint_motion import joint_rows
 from vla_eval.oracles.translation import translated
 from vla_eval.policies.context import PolicyContext
 from vla_eval.robots.arm import Arm
@@ -116,8 +117,9 @@ class ScriptedPolicy:
 class TranslatedPolicy:
     """A scripted control whose chunks, planned in `pd_ee_delta_pose`, are translated to another mode."""
 
-    def __init__(self, planner: ScriptedPolicy, mode: str) -> None:
+    def __init__(self, planner: ScriptedPolicy, arm: Arm, mode: str) -> None:
         self._planner = planner
+        self._arm = arm
         self._mode = mode
         states = tuple(dict.fromkeys((*planner.spec.states, *JOINT_STATES)))
         self.spec = replace(planner.spec, states=states)
@@ -135,6 +137,8 @@ class TranslatedPolicy:
         state = window.last.state
         planned = self._planner.act(window).actions
         qpos, qvel = (state[name].astype(float) for name in JOINT_STATES)
+        if self._arm.chain is not None:
+            return ActionChunk(actions=joint_rows(planned, self._arm, self._mode, qpos, qvel))
         return ActionChunk(actions=translated(planned, self._mode, qpos, qvel))
 
 
@@ -154,6 +158,6 @@ def in_any_control_mode(
                 f"policy '{context.name}': the expert of {context.env.task} turns the wrist, and the control "
                 f"mode {mode} has no rotation. Choose another env.control_mode, or leave this task out."
             )
-        return TranslatedPolicy(planner, mode)
+        return TranslatedPolicy(planner, arm_of(context), mode)
 
     return made
