@@ -13,6 +13,7 @@ import numpy as np
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
 from vla_eval.core import FloatArray, StepResult
 from vla_eval.errors import SpecMismatchError
+from vla_eval.robots.arm import Arm
 from vla_eval.robots.rows import PANDA
 from vla_eval.strict.bounds import Bounds, Steps, check_bounds
 
@@ -39,15 +40,22 @@ PROPRIO_STATES = ("tcp_pose", "qpos", "qvel")
 """States of the environment that both are computed from; `joints` is all of them, one after the other."""
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
-JOINT_NAMES = PANDA.joints
+JOINT_NAMES = PANDA.joints  # of the default robot, as all that names no other
 ACTION_NAMES = CONTROL_MODES[EE_DELTA_POSE].dims
-STATE_NAMES: dict[StateKind, tuple[str, ...]] = {
-    # The first two columns of the rotation matrix: no jumps, unlike roll-pitch-yaw, whose roll sits at
-    # ±π for a gripper that points down, and unlike a quaternion, which may flip its sign.
-    "eef": ("x", "y", "z", "r11", "r21", "r31", "r12", "r22", "r32", "gripper_width"),
-    # The paper's 25 numbers: pose of the tool centre point, joint positions, joint velocities.
-    "joints": (*POSE_NAMES, *JOINT_NAMES, *(f"{name}_velocity" for name in JOINT_NAMES)),
-}
+
+
+def state_names(arm: Arm) -> dict[StateKind, tuple[str, ...]]:
+    """Return kind -> the names of its numbers with a robot."""
+    return {
+        # The first two columns of the rotation matrix: no jumps, unlike roll-pitch-yaw, whose roll sits at
+        # ±π for a gripper that points down, and unlike a quaternion, which may flip its sign.
+        "eef": ("x", "y", "z", "r11", "r21", "r31", "r12", "r22", "r32", "gripper_width"),
+        # The paper's 25 numbers: pose of the tool centre point, joint positions, joint velocities.
+        "joints": (*POSE_NAMES, *arm.joints, *(f"{name}_velocity" for name in arm.joints)),
+    }
+
+
+STATE_NAMES = state_names(PANDA)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,9 +74,14 @@ class EncoderSettings:
 
 
 def dataset_features(
-    state: StateKind, *, action_names: tuple[str, ...] = ACTION_NAMES, image_size_px: int = IMAGE_SIZE_PX
+    state: StateKind,
+    *,
+    action_names: tuple[str, ...] = ACTION_NAMES,
+    image_size_px: int = IMAGE_SIZE_PX,
+    arm: Arm = PANDA,
 ) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data
     """Return the fields of a dataset as `LeRobotDataset.create(features=…)` takes them."""
+    names = state_names(arm)
 
     def vector(names: tuple[str, ...]) -> dict[str, Any]:  # Any: as above
         return {"dtype": "float32", "shape": (len(names),), "names": list(names)}
@@ -80,28 +93,31 @@ def dataset_features(
     image = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
     return {
         **{key: dict(image) for key in CAMERA_KEYS.values()},
-        STATE_KEY: vector(STATE_NAMES[state]),
+        STATE_KEY: vector(names[state]),
         ACTION_KEY: vector(action_names),
-        **{key: vector(STATE_NAMES[kind]) for kind, key in PROPRIO_KEYS.items()},
+        **{key: vector(names[kind]) for kind, key in PROPRIO_KEYS.items()},
         REWARD_KEY: scalar("float32", "reward"),
         SUCCESS_KEY: scalar("bool", "success"),
         DONE_KEY: scalar("bool", "done"),
     }
 
 
-def proprioception(state: Mapping[str, FloatArray]) -> dict[StateKind, FloatArray]:
-    """Return both kinds of proprioception of an observation, float32: `eef` (10,), `joints` (25,).
+def proprioception(state: Mapping[str, FloatArray], arm: Arm = PANDA) -> dict[StateKind, FloatArray]:
+    """Return both kinds of proprioception of an observation, float32: `eef` (10,), `joints` (7 + 2 J,).
 
-    `tcp_pose` (7,) is position in m and wxyz quaternion, world frame; see `STATE_NAMES`.
+    `tcp_pose` (7,) is position in m and wxyz quaternion, world frame; see `state_names`.
+
+    Raises:
+        SpecMismatchError: the observation is of another robot.
     """
     pose, qpos, qvel = state["tcp_pose"], state["qpos"], state["qvel"]
-    if len(qpos) != len(JOINT_NAMES):
+    if len(qpos) != len(arm.joints):
         raise SpecMismatchError(
-            f"proprioception: expected the {len(JOINT_NAMES)} joints of the Panda, found {len(qpos)}. "
-            "Datasets and learned policies are the Panda's alone: leave env.robot out."
+            f"proprioception: expected the {len(arm.joints)} joints of the robot {arm.name}, found "
+            f"{len(qpos)}. Use the robot of the dataset or of the policy: env.robot={arm.name}."
         )
     columns = rotation_columns(pose[3:])
-    width_m = qpos[-2:].sum(keepdims=True)
+    width_m = arm.gripper.width_m(qpos)[None]
     return {
         "eef": np.concatenate([pose[:3], columns, width_m]).astype(np.float32),
         "joints": np.concatenate([pose, qpos, qvel]).astype(np.float32),
@@ -120,13 +136,19 @@ def rotation_columns(quaternion_wxyz: FloatArray) -> FloatArray:
 
 
 def frame_values(
-    before: StepResult, after: StepResult, *, action: FloatArray, state: StateKind, is_last: bool
+    before: StepResult,
+    after: StepResult,
+    *,
+    action: FloatArray,
+    state: StateKind,
+    is_last: bool,
+    arm: Arm = PANDA,
 ) -> dict[str, Any]:  # Any: arrays of several types
     """Return one frame as `LeRobotDataset.add_frame` takes it, without the task string.
 
     `before` has images of all cameras, `action` (A,) is what is stored and `after` what it led to.
     """
-    kinds = proprioception(before.observation.state)
+    kinds = proprioception(before.observation.state, arm)
     return {
         **{key: before.observation.images[camera] for camera, key in CAMERA_KEYS.items()},
         STATE_KEY: kinds[state],

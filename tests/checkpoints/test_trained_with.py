@@ -38,6 +38,7 @@ FACTS = TrainingFacts(
     run_seed=0,
     sentences={COLOR: ("lift it", "lift it, please")},
     gripper_open=ENV.action.gripper_open,
+    robot=ENV.robot,
 )
 ASKED = Asked(ENV, SIZES, "eef")
 
@@ -50,6 +51,10 @@ def told(sentence: str, trained: dict[str, tuple[str, ...]] | None, task: str = 
     ("change", "said"),
     [
         ({"control_mode": "pd_joint_pos"}, "control mode: expected pd_joint_pos, found pd_ee_delta_pose"),
+        (
+            {"robot": "so100"},
+            "robot: expected so100, found panda_wristcam. Evaluate it with --set env.robot=so100",
+        ),
         ({"gripper_open": -1.0}, "the gripper's number that opens it: expected -1.0, found 1.0"),
         ({"fps": 10.0}, "control steps per second: expected 10.0, found 20.0"),
         ({"state": "joints"}, "state: expected joints, found eef"),
@@ -71,7 +76,7 @@ def test_each_fact_that_differs_is_one_line_with_both_values_and_what_to_do(
 def test_every_row_is_shown_to_differ_above() -> None:
     names = {row.what for row in compared(FACTS, ASKED)}
     assert names == {
-        *("control mode", "action dimensions", "the gripper's number that opens it"),
+        *("robot", "control mode", "action dimensions", "the gripper's number that opens it"),
         *("control steps per second", "images and their order", "size of a", "size of b", "state"),
     }
     assert differences(FACTS, ASKED) == []
@@ -91,7 +96,7 @@ def test_a_policy_of_any_control_mode_is_asked_for_that_one_alone(mode: str) -> 
 
 def test_what_is_not_known_is_not_compared() -> None:
     assert differences(None, ASKED) == []
-    assert differences(dataclasses.replace(FACTS, gripper_open=None), ASKED) == []
+    assert differences(dataclasses.replace(FACTS, gripper_open=None, robot=None), ASKED) == []
     assert differences(FACTS, Asked(ENV)) == []
 
 

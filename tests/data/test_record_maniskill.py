@@ -14,7 +14,15 @@ from vla_eval.data.opening import open_dataset, open_local_dataset
 from vla_eval.data.recording import record as recording_module
 from vla_eval.data.recording.shard_writer import new_dataset
 from vla_eval.data.replaying import replay as replay_module
-from vla_eval.features import ACTION_NAMES, CAMERA_KEYS, STATE_NAMES, EncoderSettings, dataset_features
+from vla_eval.features import (
+    ACTION_NAMES,
+    CAMERA_KEYS,
+    STATE_NAMES,
+    EncoderSettings,
+    dataset_features,
+    state_names,
+)
+from vla_eval.robots.rows import SO100
 from vla_eval.tasks.interface import ACTION, CAMERAS, states
 from vla_eval.tasks.remember import COLORS
 
@@ -98,3 +106,16 @@ def test_names_of_dimensions_are_those_of_the_environment() -> None:
     n_numbers = sum(len(spec.dims) for spec in states())
     assert n_numbers == len(STATE_NAMES["joints"]) == 25
     assert {camera.name for camera in CAMERAS} == set(CAMERA_KEYS)
+
+
+@pytest.mark.slow  # three processes start
+def test_a_recording_names_the_robot_and_its_joints_and_replays(tmp_path: Path) -> None:
+    out = tmp_path / "demos"
+    command = ["record", "--task", "ShellGameTouch-v0", "--set", "env.robot=so100", "--episodes", "1"]
+    assert main([*command, "--workers", "1", "--out", str(out)]) == 0
+    dataset = open_dataset(out / "ShellGameTouch-v0")
+    assert dataset.meta.robot_type == "so100" and dataset.was_replayed
+    features = dataset.meta.features
+    joints = features["proprio.joints"]["names"]
+    assert tuple(joints) == state_names(SO100)["joints"] and len(joints) == 19
+    assert tuple(features["action"]["names"]) == SO100.actions["pd_joint_pos"].dims

@@ -160,6 +160,6 @@ def test_datasets_and_learned_policies_do_not_take_its_joints_for_the_pandas() -
     state = {"tcp_pose": np.zeros(7), "qpos": np.zeros(15), "qvel": np.zeros(15)}
     with pytest.raises(
         SpecMismatchError,
-        match="expected the 9 joints of the Panda, found 15",
+        match=r"expected the 9 joints of the robot panda_wristcam, found 15\. .*env\.robot=panda_wristcam",
     ):
         proprioception(state)

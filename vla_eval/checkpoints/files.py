@@ -63,6 +63,7 @@ class TrainingFacts:
     # by task, empty if not known; None: not noted, as by earlier versions
     sentences: dict[str, tuple[str, ...]] | None = None
     gripper_open: float | None = None  # the gripper's number that opens it; None: not noted
+    robot: str | None = None  # None: not noted, or a robot that is not one of ours
 
 
 def find_checkpoint(path: Path) -> Path:

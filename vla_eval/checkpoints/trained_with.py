@@ -9,6 +9,7 @@ from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.errors import SpecMismatchError, some_of
 from vla_eval.features import StateKind
 from vla_eval.models.shared.sentence_reading import quoted
+from vla_eval.robots.find import ROBOT
 from vla_eval.specs import EnvSpec
 
 WORD = re.compile(r"(\{\w+\})")  # of an instruction: each episode puts its own in its place
@@ -41,7 +42,9 @@ def compared(facts: TrainingFacts, asked: Asked) -> list[Compared]:
     mode = f"Evaluate it with --set env.{CONTROL_MODE}={facts.control_mode}."
     size = "Set env.image_size, or fine-tune on images of this size."
     cameras = "Correct `cameras` in the recipe's args."
+    robot = f"Evaluate it with --set env.{ROBOT}={facts.robot}."
     rows = [
+        Compared("robot", facts.robot, env.robot, robot),
         Compared("control mode", facts.control_mode, env.action.control_mode, mode),
         Compared("action dimensions", facts.action_names, env.action.dims, mode),
         Compared(

@@ -19,7 +19,17 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.core import StepResult
 from vla_eval.envs.gymnasium_env import TaskEnv, render_settings
 from vla_eval.errors import RecipeError, SpecMismatchError, check_names
-from vla_eval.features import ACTION_KEY, CAMERA_KEYS, FPS, STATE_KEY, STATE_NAMES, StateKind, proprioception
+from vla_eval.features import (
+    ACTION_KEY,
+    CAMERA_KEYS,
+    FPS,
+    STATE_KEY,
+    STATE_NAMES,
+    StateKind,
+    proprioception,
+    state_names,
+)
+from vla_eval.robots.find import robot_of_spec
 from vla_eval.specs import EnvSpec
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
@@ -51,12 +61,13 @@ class MikasaGym(TaskEnv):
         self._state, self._seed_offset = state, seed_offset
         self.task = self._next.task
         self.task_description = self._next.instruction
+        self._arm = robot_of_spec(self.offered)
         self._max_episode_steps = self.offered.horizon_steps
         image = gym.spaces.Box(0, 255, _image_shape(self.offered), np.uint8)
         self.observation_space = gym.spaces.Dict(
             {
                 PIXELS: gym.spaces.Dict(dict.fromkeys(CAMERA_NAMES.values(), image)),
-                AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (len(STATE_NAMES[state]),), np.float32),
+                AGENT_POS: gym.spaces.Box(-np.inf, np.inf, (len(state_names(self._arm)[state]),), np.float32),
             }
         )
 
@@ -82,7 +93,7 @@ class MikasaGym(TaskEnv):
         seen = result.observation
         return {
             PIXELS: {name: seen.images[camera].copy() for camera, name in CAMERA_NAMES.items()},
-            AGENT_POS: proprioception(seen.state)[self._state].astype(np.float32),
+            AGENT_POS: proprioception(seen.state, self._arm)[self._state].astype(np.float32),
         }
 
     def _info(self, result: StepResult) -> dict[str, Any]:
@@ -96,9 +107,10 @@ def _image_shape(offered: EnvSpec) -> tuple[int, int, int]:
 
 def _features(state: StateKind, offered: EnvSpec) -> dict[str, PolicyFeature]:
     images = {f"{PIXELS}/{name}": _image_shape(offered) for name in CAMERA_NAMES.values()}
+    n_state = len(state_names(robot_of_spec(offered))[state])
     return {
         ACTION_KEY: PolicyFeature(type=FeatureType.ACTION, shape=(len(offered.action.dims),)),
-        AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(len(STATE_NAMES[state]),)),
+        AGENT_POS: PolicyFeature(type=FeatureType.STATE, shape=(n_state,)),
         **{name: PolicyFeature(type=FeatureType.VISUAL, shape=shape) for name, shape in images.items()},
     }
 

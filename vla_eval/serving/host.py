@@ -32,6 +32,8 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.recipe import load_policy_recipe
 from vla_eval.policies.registry import POLICIES, PRIVILEGED, make_from_adapter
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
+from vla_eval.robots.find import ROBOT
+from vla_eval.robots.rows import PANDA
 from vla_eval.serving.observations import (
     PROMPT_WIRE_KEY,
     STATE_WIRE_KEY,
@@ -155,9 +157,10 @@ def _environment(recipe: Recipe[PolicyRecipe], options: HostOptions) -> EnvSpec:
         return env_spec() if task is None else offered_by(task, {})
     sizes_px = {shape[0] for shape in facts.images.values()}
     size_px = sizes_px.pop() if len(sizes_px) == 1 else IMAGE_SIZE_PX
+    robot = PANDA.name if facts.robot is None else facts.robot
     if task is None:
-        return env_spec(control_mode=facts.control_mode, image_size_px=size_px)
-    return offered_by(task, {CONTROL_MODE: facts.control_mode, IMAGE_SIZE: size_px})
+        return env_spec(control_mode=facts.control_mode, image_size_px=size_px, robot=robot)
+    return offered_by(task, {ROBOT: robot, CONTROL_MODE: facts.control_mode, IMAGE_SIZE: size_px})
 
 
 def _make(recipe: Recipe[PolicyRecipe], options: HostOptions, env: EnvSpec) -> Policy:

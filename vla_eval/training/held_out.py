@@ -24,6 +24,7 @@ from vla_eval.evaluation.resolve import resolve
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import mean_return, wilson_interval
 from vla_eval.robots.find import control_mode_of
+from vla_eval.robots.rows import PANDA
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.arguments import offered_by
 from vla_eval.tasks.catalog import task_spec
@@ -222,7 +223,8 @@ def asked_warnings(facts: TrainingFacts, task: str | None, *, policy: str) -> li
         asked = instruction_for(task_spec(task))
         sentence = about_sentence(facts.sentences, asked, policy=policy, task=task)
         return [] if sentence is None else [sentence]
-    env = env_spec(control_mode=facts.control_mode)
+    robot = PANDA.name if facts.robot is None else facts.robot
+    env = env_spec(control_mode=facts.control_mode, robot=robot)
     return [f"every evaluation would refuse this policy: {line}" for line in differences(facts, Asked(env))]
 
 

@@ -17,6 +17,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.features import CAMERA_KEYS, RewardKind
 from vla_eval.models.shared.earlier_frames import SampleMemory
 from vla_eval.policies.lerobot.device import choose_device
+from vla_eval.robots.find import robots
 from vla_eval.training.dataset import chosen_episodes, training_dataset
 from vla_eval.training.held_out import check_asked, check_held_out
 from vla_eval.training.policy_config import (
@@ -98,6 +99,7 @@ class TrainingJob:
             tasks=facts.tasks,
             sentences=_with_base(dataset.sentences, None if below is None else below.sentences),
             gripper_open=action_spec(facts.control_mode).gripper_open,
+            robot=dataset.meta.robot_type if dataset.meta.robot_type in robots() else None,
         )
 
 

@@ -23,9 +23,9 @@ from vla_eval.data.opening import join_datasets, video_decoder
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.features import CAMERA_KEYS, FPS, EncoderSettings
+from vla_eval.robots.rows import PANDA
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 
-ROBOT_TYPE = "panda_wristcam"
 SHARD_EPISODES = MIKASA_FOLDER / "manifest.jsonl"
 SHARD_HISTOGRAMS = MIKASA_FOLDER / "histograms.npz"
 # One thread, so that the bytes of a video do not depend on the machine's cores.
@@ -36,7 +36,13 @@ class ShardWriter:
     """Writes one shard to `path`; a context manager that leaves either the whole shard or nothing."""
 
     def __init__(
-        self, path: Path, features: dict[str, Any], *, encoder: EncoderSettings, max_frames: int
+        self,
+        path: Path,
+        features: dict[str, Any],
+        *,
+        encoder: EncoderSettings,
+        max_frames: int,
+        robot: str = PANDA.name,
     ) -> None:
         """Take what shards must have in common to become one dataset, see `new_dataset`."""
         self._path = path
@@ -45,7 +51,9 @@ class ShardWriter:
         self._draft.parent.mkdir(parents=True, exist_ok=True)
         self._episodes: list[RecordedEpisode] = []
         self._histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
-        self._dataset = new_dataset(self._draft, features, encoder=encoder, max_frames=max_frames)
+        self._dataset = new_dataset(
+            self._draft, features, encoder=encoder, max_frames=max_frames, robot=robot
+        )
 
     def __enter__(self) -> Self:
         return self
@@ -76,7 +84,12 @@ class ShardWriter:
 
 
 def new_dataset(
-    root: Path, features: dict[str, Any], *, encoder: EncoderSettings, max_frames: int
+    root: Path,
+    features: dict[str, Any],
+    *,
+    encoder: EncoderSettings,
+    max_frames: int,
+    robot: str = PANDA.name,
 ) -> Any:  # Any: lerobot's plain data, and lerobot
     """Return a new LeRobotDataset of these fields to write episodes of up to `max_frames` into."""
     av.logging.set_libav_level(av.logging.ERROR)  # else twenty lines for each video
@@ -85,7 +98,7 @@ def new_dataset(
         fps=FPS,
         features=features,
         root=root,
-        robot_type=ROBOT_TYPE,
+        robot_type=robot,
         # Never batch_encoding_size > 1: it fails on a new dataset.
         streaming_encoding=True,
         # A full queue drops frames without an error: give a whole episode room.

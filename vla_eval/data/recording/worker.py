@@ -40,6 +40,7 @@ from vla_eval.data.simulator_runner import SimulatorRunner
 from vla_eval.errors import VlaEvalError
 from vla_eval.evaluation.worker import make_policy
 from vla_eval.features import CAMERA_KEYS, dataset_features, frame_values
+from vla_eval.robots.find import robot_of
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 from vla_eval.storage.durable import DISK_TROUBLE, storage_full
 from vla_eval.workers.inside import Heartbeat
@@ -87,12 +88,14 @@ class RecordingRunner(SimulatorRunner[RecordingJob, RecordingAnswer]):
     def _write_shard(self, job: ShardJob) -> Path:
         plan = job.plan
         env = self._make_env(dataclasses.replace(plan.group.env, cameras=tuple(CAMERA_KEYS)))
+        arm = robot_of(plan.group.env.kwargs)
         size_px, max_frames = env.spec.cameras[0].height_px, env.spec.horizon_steps
         features = dataset_features(
-            plan.recipe.state, action_names=env.spec.action.dims, image_size_px=size_px
+            plan.recipe.state, action_names=env.spec.action.dims, image_size_px=size_px, arm=arm
         )
         encoder = plan.recipe.encoder
-        with ShardWriter(job.path, features, encoder=encoder, max_frames=max_frames) as writer:
+        writing = ShardWriter(job.path, features, encoder=encoder, max_frames=max_frames, robot=arm.name)
+        with writing as writer:
             for index, one in enumerate(job.attempts, start=job.first_index):
                 start = plan.start(one.seed, horizon_steps=one.n_steps)
                 log = replay_attempt(env, start, one, heartbeat=self._heartbeat)
@@ -141,9 +144,11 @@ def frames_of(
     recipe: DatasetRecipe, episode: RecordedEpisode, log: EpisodeLog
 ) -> Sequence[dict[str, object]]:
     """Return the frames of an episode, as `ShardWriter.add_episode` takes them."""
-    actions = stored_actions(recipe, episode)
+    actions, arm = stored_actions(recipe, episode), robot_of(recipe.env)
     return [
-        frame_values(before, after, action=action, state=recipe.state, is_last=step == episode.n_steps)
+        frame_values(
+            before, after, action=action, state=recipe.state, is_last=step == episode.n_steps, arm=arm
+        )
         for step, (before, after, action) in enumerate(
             zip(log.results[:-1], log.results[1:], actions, strict=True), start=1
         )

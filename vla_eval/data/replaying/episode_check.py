@@ -12,7 +12,9 @@ from vla_eval.core import FloatArray, ImageArray
 from vla_eval.data.manifest import RecordedEpisode
 from vla_eval.data.recording.demonstrations import EpisodeLog, images_digests, states_digest
 from vla_eval.data.tables import Columns
-from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, STATE_NAMES, SUCCESS_KEY, proprioception
+from vla_eval.features import ACTION_KEY, PROPRIO_KEYS, SUCCESS_KEY, proprioception, state_names
+from vla_eval.robots.arm import Arm
+from vla_eval.robots.find import robot_of
 
 STATE_TOLERANCE = 1e-2  # m, rad, rad/s; for machines whose arithmetic differs in the last bits
 MIN_PSNR_DB: dict[Simulator, float] = {
@@ -51,7 +53,7 @@ def check_states(
     equal = states_digest(log.results) == episode.states_sha256
     found = []
     if not equal:
-        difference = _largest_difference(rows, log)
+        difference = _largest_difference(rows, log, robot_of(episode.env_kwargs))
         if expect_equal_bits or difference.value > STATE_TOLERANCE:
             found.append(f"states differ, most by {difference.value:.2g} in {difference.where}")
     success_step = next((i for i, result in enumerate(log.results) if result.status.success and i > 0), None)
@@ -103,11 +105,13 @@ class _Difference(NamedTuple):
     where: str
 
 
-def _largest_difference(rows: Columns, log: EpisodeLog) -> _Difference:
-    fresh: FloatArray = np.stack([proprioception(r.observation.state)["joints"] for r in log.results[:-1]])
+def _largest_difference(rows: Columns, log: EpisodeLog, arm: Arm) -> _Difference:
+    fresh: FloatArray = np.stack(
+        [proprioception(r.observation.state, arm)["joints"] for r in log.results[:-1]]
+    )
     stored = rows[PROPRIO_KEYS["joints"]].astype(np.float32)
     if stored.shape != fresh.shape:
         return _Difference(float("inf"), f"length at step {min(len(stored), len(fresh))}")
     gap = np.abs(stored - fresh)
     step, dim = (int(i) for i in np.unravel_index(int(gap.argmax()), gap.shape))
-    return _Difference(float(gap[step, dim]), f"{STATE_NAMES['joints'][dim]} at step {step}")
+    return _Difference(float(gap[step, dim]), f"{state_names(arm)['joints'][dim]} at step {step}")

@@ -14,6 +14,7 @@ from vla_eval.data.sharing.initial_states import Frames, InitialStates
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import DatasetError, some_of
 from vla_eval.features import CAMERA_KEYS, StateKind, proprioception
+from vla_eval.robots.find import robot_of
 from vla_eval.strict.bounds import MAX_SEED
 from vla_eval.tasks.catalog import task_spec
 
@@ -123,7 +124,7 @@ def _starts(settings: EnvSettings, seeds: Sequence[int], *, render: bool = False
         for seed in seeds:
             observation = env.reset({SLOT: seed}, render=render)[SLOT].observation
             images = {camera: observation.images[camera] for camera in settings.cameras}
-            states = proprioception(observation.state)
+            states = proprioception(observation.state, robot_of(settings.kwargs))
             found.append(_Start(seed=seed, states=states, frames=images))
         return found
     finally:

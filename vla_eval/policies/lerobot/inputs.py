@@ -14,7 +14,10 @@ from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differe
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
-from vla_eval.features import STATE_KEY, STATE_NAMES, StateKind, proprioception
+from vla_eval.features import STATE_KEY, StateKind, proprioception, state_names
+from vla_eval.robots.arm import Arm
+from vla_eval.robots.find import robot_of_spec
+from vla_eval.robots.rows import PANDA
 from vla_eval.specs import EnvSpec
 
 MAX_UNIT = 1.0 + 1e-3  # statistics of images in [0, 1]; those of 0 … 255 are far beyond
@@ -28,6 +31,7 @@ class InputMap:
     # camera of the environment -> field, as the dataset named it, in the policy's order
     cameras: Mapping[str, str]
     state: StateKind | None  # which proprioception `observation.state` is; None for a policy without any
+    arm: Arm = PANDA  # whose it is
 
     def tensors(self, observation: Observation) -> dict[str, Tensor]:
         """Return images (3, H, W) float32 in [0, 1] and state (D,) float32, by field."""
@@ -37,7 +41,7 @@ class InputMap:
         }
         if self.state is not None:
             given = observation.state.get(self.state)  # a client may have computed it
-            state = proprioception(observation.state)[self.state] if given is None else given
+            state = proprioception(observation.state, self.arm)[self.state] if given is None else given
             fields[STATE_KEY] = torch.from_numpy(state)
         return fields
 
@@ -81,8 +85,9 @@ def input_map(
             )
         cameras[camera] = raw_field
     _check_action(loaded_config, env, policy)
-    kind = _state_kind(loaded_config, preprocessor, options.state, policy)
-    return InputMap(cameras=cameras, state=kind)
+    arm = robot_of_spec(env)
+    kind = _state_kind(loaded_config, preprocessor, options.state, policy, arm)
+    return InputMap(cameras=cameras, state=kind, arm=arm)
 
 
 def check_training(
@@ -170,7 +175,9 @@ def _expected_cameras(config: Any, absent: Sequence[str], policy: str) -> dict[s
     }
 
 
-def _state_kind(config: Any, preprocessor: Any, wanted: StateKind | None, policy: str) -> StateKind | None:
+def _state_kind(
+    config: Any, preprocessor: Any, wanted: StateKind | None, policy: str, arm: Arm
+) -> StateKind | None:
     feature = config.robot_state_feature
     if feature is None:
         return None
@@ -180,7 +187,7 @@ def _state_kind(config: Any, preprocessor: Any, wanted: StateKind | None, policy
         (int(np.asarray(value).size) for name, value in statistics.items() if name != "count"), None
     )
     n_dims = int(feature.shape[0]) if n_dims is None else n_dims
-    sizes = {kind: len(names) for kind, names in STATE_NAMES.items()}
+    sizes = {kind: len(names) for kind, names in state_names(arm).items()}
     fitting = [kind for kind, size in sizes.items() if size == n_dims]
     if wanted is None and len(fitting) == 1:
         return fitting[0]
