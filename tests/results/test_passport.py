@@ -4,6 +4,7 @@ import itertools
 import re
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -14,10 +15,11 @@ from vla_eval.results.grouping import group_runs
 from vla_eval.results.passport.fields import BY_NAME, FIELDS, SETTINGS, owner_of, setting_sections
 from vla_eval.results.passport.passport import Passport, classes, differences
 from vla_eval.results.report import build_table, render
-from vla_eval.results.side_by_side.of_row import passports_of
+from vla_eval.results.side_by_side.of_row import SUITES, passports_of
 from vla_eval.seeding import SeedRange
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import JsonValue, StoredRun
+from vla_eval.tasks.spec import Suite
 
 DOCS = Path(__file__).parents[2] / "docs"
 SETTLED: dict[str, JsonValue] = {
@@ -87,6 +89,8 @@ def test_the_figures_of_each_effect_stand_on_the_page_it_names() -> None:
         ({"env": {"image_size": 256}}, "image_size"),
         ({"env": {"control_mode": "pd_joint_pos"}}, "control_mode"),
         ({"env": {"robot_uids": "fetch_at_table"}}, "robot"),
+        ({"env": {"robot": "fetch"}}, "robot"),
+        ({"env": {"robot": "of a package that is not installed"}}, "robot"),
         ({"env": {"delay_steps": 5}}, "world"),
         ({"env": {"strict_choice": True}}, "success_rule"),
         ({"cue_view": "hidden"}, "world"),
@@ -101,10 +105,19 @@ def test_a_setting_is_found_in_its_field_alone(config: dict[str, JsonValue], fie
 
 
 def test_what_is_named_and_what_stands_without_being_named_are_the_same() -> None:
-    named: JsonValue = {"control_mode": "pd_ee_delta_pose", "image_size": 128, "horizon_steps": 60}
+    named: JsonValue = {
+        "control_mode": "pd_ee_delta_pose",
+        "image_size": 128,
+        "horizon_steps": 60,
+        "robot": "panda_wristcam",
+    }
     assert changed(env=named) == []
     table = build_table([run_with(), run_with("q", "runs/b", env=named)])
     assert {row.variant for row in table.rows} == {None}
+
+
+def test_every_suite_has_words() -> None:
+    assert set(SUITES) == set(get_args(Suite))
 
 
 def test_the_usual_horizon_is_the_tasks_and_in_another_version_unknown() -> None:

@@ -4,10 +4,11 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from typing import Any  # arguments of tasks
 
-from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE
-from vla_eval.errors import TaskArgumentError
+from vla_eval.control_modes import CONTROL_MODE
+from vla_eval.errors import TaskArgumentError, UnknownNameError
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.results.passport.fields import setting_sections
+from vla_eval.robots.find import ROBOT, ROBOT_UIDS, control_mode_of, robot_of
 from vla_eval.storage.run_file import DEVICE, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.arguments import HORIZON, horizon_steps, longest_wait_steps
@@ -61,18 +62,36 @@ def usual_arguments(run: StoredRun, task: str) -> dict[str, str]:
     spec, env = task_of(run, task), arguments_of(run)
     if spec is None or env is None or spec.is_base or run.description.config.get("simulator") == FAKE:
         return {}
-    usual = {CONTROL_MODE: EE_DELTA_POSE, IMAGE_SIZE: str(IMAGE_SIZE_PX)}
+    usual = {IMAGE_SIZE: str(IMAGE_SIZE_PX), **_of_robot(env)}
     horizon = _usual_horizon(spec, env)
     if horizon is not None:
         usual[HORIZON] = str(horizon)
     return {f"{ENV}{name}": text for name, text in usual.items()}
 
 
+def robot_name(env: Mapping[str, Any]) -> str:
+    """Return the robot that arguments name, or the default; as they name it if it is not installed here."""
+    try:
+        return robot_of(env).name
+    except (TaskArgumentError, UnknownNameError):
+        return str(env.get(ROBOT, env.get(ROBOT_UIDS)))
+
+
+def _of_robot(env: Mapping[str, Any]) -> dict[str, str]:
+    """Return the robot, where no argument names one, and the control mode that it then has."""
+    try:
+        usual = {CONTROL_MODE: control_mode_of(env)}
+    except (TaskArgumentError, UnknownNameError):
+        return {}
+    return usual if ROBOT_UIDS in env else {ROBOT: robot_name(env), **usual}
+
+
 def _usual_horizon(spec: TaskSpec, env: Mapping[str, Any]) -> int | None:
     """Return the control steps of an episode for which no horizon is named; None if that is impossible."""
     try:
         return horizon_steps(spec, 0 if spec.is_official else longest_wait_steps(spec, env))
-    except TaskArgumentError:  # the phases are too long without the horizon that the run names
+    except (TaskArgumentError, UnknownNameError):
+        # The phases are too long without the horizon that the run names, or its robot is not installed here.
         return None
 
 

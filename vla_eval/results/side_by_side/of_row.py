@@ -12,26 +12,31 @@ from vla_eval.results.passport.settings import (
     ENV,
     arguments_of,
     prompts_of,
+    robot_name,
     settings_of,
     task_of,
     task_version,
     usual_arguments,
 )
+from vla_eval.robots.rows import PANDA
 from vla_eval.seeding import SeedRange, seed_ranges
 from vla_eval.storage.run_file import leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.storage.trained_on import seeds_of_training
-from vla_eval.tasks.arguments import HORIZON, ROBOT
+from vla_eval.tasks.arguments import HORIZON
 from vla_eval.tasks.catalog import find_task
 from vla_eval.tasks.interface import IMAGE_SIZE
+from vla_eval.tasks.spec import Suite
 
 NULL = "null"  # of JSON
-PANDA = "Panda"
+ROBOTS = {PANDA.name: "Panda"}
+"""Name of a robot -> what published results call it."""
 NONE = "none"
 AS_DESIGNED = "as designed"
 OWN = "this repository's"
-SUITES = {
+SUITES: Mapping[Suite, str] = {
     "paper": OWN,
+    "objects": OWN,
     "mikasa_vla_90": "MIKASA-Robo-VLA",
     "mikasa_official": "MIKASA-Robo v0",
     "mikasa_base": "MIKASA-Base",
@@ -127,7 +132,10 @@ def _robot(row: RowOfRun) -> str | None:
     env = arguments_of(row.run)
     if _is_base(row):
         return NONE
-    return None if env is None else str(env.get(ROBOT, PANDA))
+    if env is None:
+        return None
+    name = robot_name(env)
+    return ROBOTS.get(name, name)
 
 
 def horizon_of(run: StoredRun, task: str) -> int | None:
