@@ -1,5 +1,7 @@
 """Comparing chunk lengths and policies: who is paired with whom, what was seen, how much more is needed."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import load_recipe
 from vla_eval.errors import ReportError, UnknownNameError
 from vla_eval.latency import EpisodeDelays
+from vla_eval.motion import Motion
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.grouping import RowKey
 from vla_eval.results.sweep import (
@@ -156,6 +159,26 @@ def test_the_text_names_what_the_figures_are() -> None:
     line = next(line for line in text.splitlines() if "| p      |  4 " in line)
     assert "-1.00" in line and "0.125" in line  # 2 · 0.5⁴
     assert render_sweep(sweep, "csv").startswith("task,policy,K,episodes,success")
+
+
+def test_how_the_arm_moved_stands_beside_success_where_a_row_has_it() -> None:
+    still, moved = episodes("p", 1, "++"), episodes("p", 4, "+-")
+    way = Motion(
+        border_jump_m=0.006, border_jump_rad=None, median_step_m=0.004, median_step_rad=None, jerk_m_s3=12.0
+    )
+    held = [
+        replace(one, n_steps=60, n_held_steps=n, motion=way) for one, n in zip(moved, (6, 12), strict=True)
+    ]
+    sweep = compare_runs([stored(still, held)])
+    rows = json.loads(render_sweep(sweep, "json"))["rows"]
+    (found,) = (one for one in rows if one["n_action_steps"] == 4)
+    assert found["held_share"] == pytest.approx((6 / 60 + 12 / 60) / 2)
+    assert found["border_jump"] == pytest.approx(0.006 / 0.004) and found["border_turn_jump"] is None
+    head, _, first, second, *notes = render_sweep(sweep, "markdown").splitlines()
+    assert head.count("jump") == 1 and "delay" not in head  # no row has a turn, or a delay
+    assert "0.15" in second and "1.50" in second and "12.0" in second and "0.15" not in first
+    assert [note.partition(":")[0] for note in notes[-2:]] == ["- held", "- jump"]
+    assert "jerk" not in render_sweep(compare_runs([stored(still, moved)]), "markdown")
 
 
 def test_the_verb_prints_the_table_of_a_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

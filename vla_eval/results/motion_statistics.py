@@ -61,7 +61,8 @@ def _ratio(jump: float | None, step: float | None) -> float | None:
     return None if jump is None or not step else jump / step
 
 
-def _shown(value: float | None, form: str) -> str:
+def shown(value: float | None, form: str) -> str:
+    """Return a number in a form; `—` for 0 and for what is not known."""
     return UNDEFINED if not value else format(value, form)
 
 
@@ -77,9 +78,9 @@ TIMING: Statistic[Timing] = Statistic(
     estimate=_timing,
     cells=lambda value: value._asdict(),
     columns=(
-        Column("held", lambda row: _shown(row[TIMING].held_share, ".2f"), name="held", rank=9),
-        Column("age", lambda row: _shown(row[TIMING].mean_age_steps, ".1f"), name="age", is_extra=True),
-        Column("delay", lambda row: _shown(row[TIMING].mean_delay_steps, ".1f"), name="delay", rank=10),
+        Column("held", lambda row: shown(row[TIMING].held_share, ".2f"), name="held", rank=9),
+        Column("age", lambda row: shown(row[TIMING].mean_age_steps, ".1f"), name="age", is_extra=True),
+        Column("delay", lambda row: shown(row[TIMING].mean_delay_steps, ".1f"), name="delay", rank=10),
     ),
     notes=_timing_notes,
 )
@@ -87,13 +88,13 @@ SMOOTHNESS: Statistic[Smoothness] = Statistic(
     estimate=_smoothness,
     cells=lambda value: value._asdict(),
     columns=(
-        Column("jump", lambda row: _shown(row[SMOOTHNESS].border_jump, ".2f"), name="jump", is_extra=True),
+        Column("jump", lambda row: shown(row[SMOOTHNESS].border_jump, ".2f"), name="jump", is_extra=True),
         Column(
             "turn jump",
-            lambda row: _shown(row[SMOOTHNESS].border_turn_jump, ".2f"),
+            lambda row: shown(row[SMOOTHNESS].border_turn_jump, ".2f"),
             name="turn_jump",
             is_extra=True,
         ),
-        Column("jerk m/s³", lambda row: _shown(row[SMOOTHNESS].jerk_m_s3, ".1f"), name="jerk", is_extra=True),
+        Column("jerk m/s³", lambda row: shown(row[SMOOTHNESS].jerk_m_s3, ".1f"), name="jerk", is_extra=True),
     ),
 )

@@ -7,6 +7,7 @@ from dataclasses import replace
 from vla_eval.results.comparison import Comparison
 from vla_eval.results.estimates import CONFIDENCE
 from vla_eval.results.formats import Format
+from vla_eval.results.motion_statistics import SMOOTHNESS, TIMING, shown
 from vla_eval.results.own_statistics import rate
 from vla_eval.results.printed_table import (
     UNDEFINED,
@@ -20,6 +21,11 @@ from vla_eval.results.printed_table import (
 from vla_eval.results.sweep import Sweep, SweepRow
 
 JSON_VERSION = 1
+MOTION_NOTES = {
+    "held": "held: share of the control steps at which no chunk had an action and the arm held still.",
+    "jump": "jump: at borders of chunks, as a multiple of the median step; docs/real_time.md.",
+}
+"""Column -> what it is."""
 
 
 def render_sweep(sweep: Sweep, fmt: Format, *, width: int | None = None) -> str:
@@ -92,6 +98,8 @@ def _values(row: SweepRow, sweep: Sweep) -> dict[str, object]:
         "paired_p_raw": one.test.p_value if one else None,
         "paired_p": one.corrected_p if one else None,
         "episodes_to_settle": row.n_to_settle,
+        **TIMING.estimate(row.evidence)._asdict(),
+        **SMOOTHNESS.estimate(row.evidence)._asdict(),
     }
 
 
@@ -104,6 +112,7 @@ def _notes(sweep: Sweep) -> list[str]:
         "the two differed here.",
         "cue frames: number of frames of the cue that the policy got in an episode. A policy that reads only "
         "the last frame may have forgotten them when it chooses; scripted controls read no images.",
+        *(MOTION_NOTES[one.title] for one in _motion_columns(sweep) if one.title in MOTION_NOTES),
     ]
 
 
@@ -136,6 +145,29 @@ def _columns(sweep: Sweep) -> list[Column[SweepRow]]:
             lambda row: UNDEFINED if row.n_to_settle is None else str(row.n_to_settle),
             rank=3,
         ),
+        *_motion_columns(sweep),
+    ]
+
+
+def _motion_columns(sweep: Sweep) -> list[Column[SweepRow]]:
+    """Return how the arm moved, as far as some row has a value; the first to go where it is narrow."""
+
+    def column(
+        rank: int, title: str, value: Callable[[SweepRow], float | None], form: str
+    ) -> Column[SweepRow]:
+        return Column(title, lambda row: shown(value(row), form), rank=rank)
+
+    values: dict[str, tuple[Callable[[SweepRow], float | None], str]] = {
+        "held": (lambda row: TIMING.estimate(row.evidence).held_share, ".2f"),
+        "delay": (lambda row: TIMING.estimate(row.evidence).mean_delay_steps, ".1f"),
+        "jump": (lambda row: SMOOTHNESS.estimate(row.evidence).border_jump, ".2f"),
+        "turn jump": (lambda row: SMOOTHNESS.estimate(row.evidence).border_turn_jump, ".2f"),
+        "jerk m/s³": (lambda row: SMOOTHNESS.estimate(row.evidence).jerk_m_s3, ".1f"),
+    }
+    return [
+        column(10 + number, title, value, form)
+        for number, (title, (value, form)) in enumerate(values.items())
+        if any(value(row) for row in sweep.rows)
     ]
 
 
