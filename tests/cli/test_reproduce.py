@@ -8,6 +8,7 @@ import pytest
 
 from vla_eval.cli.main import main
 from vla_eval.cli.reproduce import outcomes
+from vla_eval.errors import RecipeError
 from vla_eval.results.claims import read_claim
 from vla_eval.storage.run_folder import read_run
 
@@ -99,6 +100,8 @@ def test_a_published_row_is_a_claim_with_its_notes() -> None:
     row = read_claim("leaderboard_mikasa/memory", task="RememberColor9-v0")
     assert (row.claim.n_success, row.claim.n_episodes, row.n_action_steps) == (97, 100, 4)
     assert any("simplified mesh" in note for note in row.notes)
+    with pytest.raises(RecipeError, match="does not say of how many episodes"):
+        read_claim("GMP", task=COLOR)  # perhaps 100, which is not taken as known
     several = read_claim("OpenVLA", task=COLOR, n_action_steps=8)
     assert (several.claim.n_success, several.claim.n_episodes) == (59, 100)
     assert any("mean of 3 trainings" in note for note in several.notes)

@@ -144,7 +144,9 @@ def _of_cell(row: PublishedResult, task: str, n_action_steps: int | None) -> Cla
             "uncertainty is not known. Give the claim as K/N."
         )
     rate = row.rates[task].rate
-    notes = [f"{row.method}: {text}." for text in (*row.differs, *filter(None, [row.contested.get(task)]))]
+    stated = [*row.differs, *(f"perhaps {name}: {text}" for name, text in row.perhaps.items())]
+    stated += [row.contested[task]] if task in row.contested else []
+    notes = [f"{row.method}: {text}." for text in stated]
     if (row.runs or 1) > 1:
         notes.append(
             f"The rate is a mean of {row.runs} trainings, taken as one of {row.episodes} episodes: how far "
