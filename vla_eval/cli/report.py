@@ -21,7 +21,8 @@ table: rows with the same task, policy, n_action_steps and settings are put toge
 --published and --imported print published and imported results alone.
 
 With --html, a page with plots, choices, errors and videos is written instead, and its path printed. With
---filmstrip, an image per row of the table: ten seeds, cue | reveal | touch."""
+--filmstrip, an image per row of the table: ten seeds, cue | reveal | touch. With --export, a JSON file for
+other programs."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -54,6 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
     parser.add_argument(
+        "--export",
+        type=Path,
+        metavar="FILE",
+        help="write rows and passports as JSON with a schema, for other programs (docs/exported.md)",
+    )
+    parser.add_argument(
         "--filmstrip",
         type=Path,
         metavar="DIR",
@@ -82,6 +89,8 @@ def run(args: argparse.Namespace) -> int:
         _check_alone("--html writes a page", args)
     if args.filmstrip is not None:
         _check_alone("--filmstrip writes a contact sheet", args)
+    if args.export is not None:
+        _check_alone("--export writes a file", args)
     if args.html is not None:
         from vla_eval.page.build import write_page
         from vla_eval.probe.page.sections import probe_sections
@@ -97,7 +106,9 @@ def run(args: argparse.Namespace) -> int:
         print(page)
     if args.filmstrip is not None:
         _write_filmstrips(runs, args.filmstrip)
-    if args.html is not None or args.filmstrip is not None:
+    if args.export is not None:
+        _export(runs, args)
+    if any(one is not None for one in (args.html, args.filmstrip, args.export)):
         return 0
     print_table(runs, args, columns=args.columns)
     if args.format == "markdown":
@@ -111,7 +122,7 @@ def _print_beside(args: argparse.Namespace) -> int:
     from vla_eval.results.table_formats import render_beside
 
     is_none = args.published is None and not args.imported
-    if is_none or args.html is not None or args.filmstrip is not None:
+    if is_none or any(one is not None for one in (args.html, args.filmstrip, args.export)):
         raise ReportError("Name at least one RUN, a run folder, or --published or --imported alone.")
     rows = imported_rows(args.imported)
     print_in(args.format, render_beside(args.format, published=args.published, imported=rows))
@@ -125,6 +136,17 @@ def _check_alone(written: str, args: argparse.Namespace) -> None:
             f"{written}, which has no --format, --preset, --columns, --wide, --paper and --imported. Remove "
             "them."
         )
+
+
+def _export(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+    from vla_eval.results.export import export_text
+    from vla_eval.results.report import build_table
+    from vla_eval.storage.durable import replace_file
+
+    table = build_table(runs, baseline=args.baseline, protocols=args.protocols)
+    args.export.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(args.export, export_text(table))
+    print(args.export)
 
 
 def _write_filmstrips(runs: "Sequence[StoredRun]", folder: Path) -> None:

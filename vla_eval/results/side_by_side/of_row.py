@@ -111,7 +111,7 @@ def _tasks(row: RowOfRun) -> str | None:
     spec, version = find_task(row.key.task), task_version(row.run, row.key.task)
     if spec is None or version is None:
         return None
-    return f"{SUITES[spec.suite]}, version {version}" if spec.suite == "paper" else SUITES[spec.suite]
+    return f"{SUITES[spec.suite]}, version {version}" if SUITES[spec.suite] == OWN else SUITES[spec.suite]
 
 
 def _instructions(row: RowOfRun) -> str | None:
