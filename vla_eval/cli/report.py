@@ -61,6 +61,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="write rows and passports as JSON with a schema, for other programs (docs/exported.md)",
     )
     parser.add_argument(
+        "--card",
+        type=Path,
+        metavar="FILE",
+        help="write the rows of one policy into the model-index of a model card, README.md of a checkpoint",
+    )
+    parser.add_argument(
         "--filmstrip",
         type=Path,
         metavar="DIR",
@@ -91,6 +97,8 @@ def run(args: argparse.Namespace) -> int:
         _check_alone("--filmstrip writes a contact sheet", args)
     if args.export is not None:
         _check_alone("--export writes a file", args)
+    if args.card is not None:
+        _check_alone("--card writes into a file", args)
     if args.html is not None:
         from vla_eval.page.build import write_page
         from vla_eval.probe.page.sections import probe_sections
@@ -108,7 +116,9 @@ def run(args: argparse.Namespace) -> int:
         _write_filmstrips(runs, args.filmstrip)
     if args.export is not None:
         _export(runs, args)
-    if any(one is not None for one in (args.html, args.filmstrip, args.export)):
+    if args.card is not None:
+        _write_card(runs, args)
+    if any(one is not None for one in (args.html, args.filmstrip, args.export, args.card)):
         return 0
     print_table(runs, args, columns=args.columns)
     if args.format == "markdown":
@@ -122,7 +132,7 @@ def _print_beside(args: argparse.Namespace) -> int:
     from vla_eval.results.table_formats import render_beside
 
     is_none = args.published is None and not args.imported
-    if is_none or any(one is not None for one in (args.html, args.filmstrip, args.export)):
+    if is_none or any(one is not None for one in (args.html, args.filmstrip, args.export, args.card)):
         raise ReportError("Name at least one RUN, a run folder, or --published or --imported alone.")
     rows = imported_rows(args.imported)
     print_in(args.format, render_beside(args.format, published=args.published, imported=rows))
@@ -147,6 +157,22 @@ def _export(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
     args.export.parent.mkdir(parents=True, exist_ok=True)
     replace_file(args.export, export_text(table))
     print(args.export)
+
+
+def _write_card(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+    from vla_eval.results.model_card import with_results
+    from vla_eval.results.report import build_table
+    from vla_eval.storage.durable import replace_file
+
+    try:
+        text = args.card.read_text(encoding="utf-8") if args.card.exists() else ""
+    except UnicodeDecodeError as exc:
+        raise ReportError(f"{args.card}: expected a model card, found {exc}.") from exc
+    table = build_table(runs, baseline=args.baseline, protocols=args.protocols)
+    new = with_results(text, table, where=str(args.card))
+    args.card.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(args.card, new)
+    print(args.card)
 
 
 def _write_filmstrips(runs: "Sequence[StoredRun]", folder: Path) -> None:

@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 DESCRIPTION = """Run a policy on fresh seeds, under the conditions of a claim, until it is known whether it is
 as good as was claimed: *reproduced* (it has lost less than --loss), *below the claim*, or *not decided*.
 
-CLAIM is a run folder, a published row (`leaderboard_mikasa/MemoryVLA`; `mikasa-vla report --published` shows
-them), or a number of successes, `91/100`. It is taken with its uncertainty: 20 of 20 is not 1.00. The test
-may stop after each episode. The same command resumes."""
+CLAIM is a run folder, a model card, a published row (`leaderboard_mikasa/MemoryVLA`; `mikasa-vla report
+--published` shows them), or a number of successes, `91/100`. It is taken with its uncertainty: 20 of 20 is
+not 1.00. The test may stop after each episode. The same command resumes."""
 EPILOG = """exit codes: 0 reproduced; 4 below the claim; 5 not decided; 1 a mistake (see the message); 3 an
 episode ended in an error before it was decided (the same command retries it). docs/reproduce.md explains the
 test."""

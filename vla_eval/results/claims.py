@@ -1,4 +1,4 @@
-"""Read a claim: of a run folder, of a published row, or as a number of successes; and how it was measured."""
+"""Read a claim, of a run folder, a card, a published row or as a count; and how it was measured."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -11,8 +11,10 @@ from vla_eval.config.recorded_chunking import read_chunking
 from vla_eval.errors import RecipeError, some_of, unknown_name
 from vla_eval.results.acceptance import Claim
 from vla_eval.results.grouping import POLICY_NAMES, RowEpisodes, RowKey, group_runs
+from vla_eval.results.model_card import CARD, results_of_card
 from vla_eval.results.passport.settings import TASK_VERSIONS, task_version
 from vla_eval.results.published.literature import PublishedResult, load_published
+from vla_eval.storage.folders import RUN, kind_of
 from vla_eval.storage.run_folder import StoredRun, read_run
 from vla_eval.tasks.catalog import task_spec
 
@@ -44,14 +46,15 @@ def read_claim(
     """Return the claim that a text names.
 
     Args:
-        text: a run folder, a published row (`BOARD/METHOD` or `METHOD`), or `K/N` successes.
+        text: a run folder, a model card or the folder that it lies in, a published row (`BOARD/METHOD` or
+            `METHOD`), or `K/N` successes.
         task: the task that the claim is of, where there are several.
         n_action_steps: likewise.
         of: the policy of a run folder that the claim is of, likewise.
 
     Raises:
         RecipeError: it is a claim of several things, or of nothing that can be measured again.
-        RunFolderError, UnknownNameError: there is no such folder or row.
+        RunFolderError, ReportError, UnknownNameError: there is no such folder, card or row.
     """
     if match := COUNT.fullmatch(text):
         if task is None:
@@ -60,8 +63,11 @@ def read_claim(
         n_success, n_episodes = map(int, match.groups())
         claim = Claim(n_success=n_success, n_episodes=n_episodes)
         return Claimed(claim=claim, of="the claim", task=task, n_action_steps=n_action_steps)
-    if Path(text).exists():
-        return _of_run(read_run(Path(text)), task=task, n_action_steps=n_action_steps, of=of)
+    path = Path(text)
+    if path.is_file() or (path.is_dir() and kind_of(path) != RUN and (path / CARD).is_file()):
+        return _of_card(path, task=task, n_action_steps=n_action_steps)
+    if path.exists():
+        return _of_run(read_run(path), task=task, n_action_steps=n_action_steps, of=of)
     return _of_row(text, task=task, n_action_steps=n_action_steps)
 
 
@@ -110,6 +116,30 @@ def _check_version(run: StoredRun, task: str) -> None:
             f"{run.path}: {task}: the claim is of version {claimed} of the task, and this package has "
             f"version {now}: CHANGELOG.md says what differs. Measure the claim again."
         )
+
+
+def _of_card(path: Path, *, task: str | None, n_action_steps: int | None) -> Claimed:
+    wanted = {"task": task, "n_action_steps": n_action_steps}
+    every = results_of_card(path)
+    found = [
+        one for one in every if task in (None, one.task) and n_action_steps in (None, one.n_action_steps)
+    ]
+    if not found:
+        known = some_of(f"{one.task} K={one.n_action_steps}" for one in every)
+        raise RecipeError(
+            f"{path}: expected a result with {_asked(wanted) or 'a rate'}, found {known or 'none'}. "
+            "`mikasa-vla report --card` writes results into a card."
+        )
+    _check_one(str(path), [f"{one.task} K={one.n_action_steps}" for one in found], "--task, --n-action-steps")
+    (one,) = found
+    task_spec(one.task)  # whether there is one
+    return Claimed(
+        claim=Claim(n_success=one.n_success, n_episodes=one.n_episodes),
+        of=f"{one.task} in {path}",
+        task=one.task,
+        n_action_steps=one.n_action_steps or n_action_steps,
+        notes=tuple(f"the card says: {name}: {text}." for name, text in one.settings.items()),
+    )
 
 
 def _of_row(text: str, *, task: str | None, n_action_steps: int | None) -> Claimed:
