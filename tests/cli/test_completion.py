@@ -33,7 +33,7 @@ def test_bash_offers_verbs_flags_and_names(
     monkeypatch.chdir(tmp_path)
     completion = script(capsys, "bash")
     assert offered(completion, "") == list(VERBS)
-    assert offered(completion, "rep") == ["report", "replay"]
+    assert offered(completion, "rep") == ["report", "reproduce", "replay"]
     assert offered(completion, "eval", "--capt") == ["--capture-video", "--capture-rrd", "--capture-strip"]
     assert offered(completion, "eval", "--policy", "cue_b") == ["cue_blind"]
     assert offered(completion, "eval", "--policy", "oracle", "cue_b") == ["cue_blind"]

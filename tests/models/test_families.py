@@ -22,7 +22,10 @@ from vla_eval.storage.run_folder import read_run
 from vla_eval.testing.tiny_table import _tiny_recipe
 
 PACKAGE = Path(__file__).parents[2] / "vla_eval"
-ROWS = (PACKAGE / "models" / "families.py", PACKAGE / "models" / "family.py")
+ROWS = (
+    *(PACKAGE / "models" / "families.py", PACKAGE / "models" / "family.py"),
+    PACKAGE / "results" / "imported" / "programs.py",  # names of other programs, one of which is a family's
+)
 WORDS = {"act", "diffusion", "memory", "sequence"}
 """Names of types and of folders that are words of English, too: of these only the modules are looked for."""
 SHORT = {"steps": 3, "batch_size": 2, "save_every_steps": 3, "log_every_steps": 1, "num_workers": 0}

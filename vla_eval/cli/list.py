@@ -29,6 +29,7 @@ Row = Sequence[str]
 Groups = Mapping[str, Sequence[Row]]
 """Heading -> rows; a list without groups has one, without a heading."""
 UNGROUPED, BROKEN, OF_PACKAGES = "", "cannot be read", "of other packages"
+THINGS = "with everyday things"  # own tasks beyond the paper's table
 BASELINES = "baselines and controls"
 READY, TO_TRAIN, FROM_BASE = (
     "ready to evaluate",
@@ -96,6 +97,8 @@ def _tasks(suite: Suite = "paper", memory: MemoryType | None = None) -> Groups:
             continue
         groups.setdefault(spec.split or UNGROUPED, []).append(_task(spec))
     if suite == "paper":
+        things = SUITES["objects"].values()
+        groups[THINGS] = [_task(one) for one in things if memory in (None, *one.memory_types)]
         try:
             groups[OF_PACKAGES] = [_task(spec) for spec in installed_tasks().values()]
         except PluginError as exc:

@@ -72,8 +72,8 @@ def test_an_episode_executes_what_the_original_predicts(
     # The fixture's state has as many numbers as LIBERO's, and none of ours.
     names = tuple(f"s{i}" for i in range(golden.PROPRIO))
     state = values["in.proprio_raw"][sample].float().numpy()
-    monkeypatch.setattr(lerobot_inputs, "STATE_NAMES", {"libero": names})
-    monkeypatch.setattr(lerobot_inputs, "proprioception", lambda _state: {"libero": state})
+    monkeypatch.setattr(lerobot_inputs, "state_names", lambda _arm: {"libero": names})
+    monkeypatch.setattr(lerobot_inputs, "proprioception", lambda _state, _arm: {"libero": state})
     checkpoint = converted(published, tmp_path, case)
     policy: Any = make_paper_compat(context(env, golden.CHUNK), checkpoint=str(checkpoint), device="cpu")
     n_steps = golden.CHUNK
