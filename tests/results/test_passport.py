@@ -116,6 +116,10 @@ def test_what_is_named_and_what_stands_without_being_named_are_the_same() -> Non
     assert {row.variant for row in table.rows} == {None}
 
 
+def test_episodes_that_stop_at_their_first_success_have_the_same_success_once() -> None:
+    assert changed(stop_at_success=True) == []
+
+
 def test_every_suite_has_words() -> None:
     assert set(SUITES) == set(get_args(Suite))
 

@@ -155,7 +155,7 @@ def _success_rule(row: RowOfRun) -> str | None:
         return None
     parts = ["success at any step"]
     parts += ["the first wrong choice ends the episode"] if env.get("strict_choice") is True else []
-    parts += ["stopped at the first success"] if row.run.description.config.get("stop_at_success") else []
+    # Where episodes stop at their first success, success once is the same.
     return ", ".join(parts)
 
 
