@@ -116,6 +116,18 @@ def test_what_is_named_and_what_stands_without_being_named_are_the_same() -> Non
     assert {row.variant for row in table.rows} == {None}
 
 
+def test_a_robot_is_the_same_by_its_name_and_by_maniskills() -> None:
+    named, by_uid = (
+        run_with(env={"robot": "fetch"}),
+        run_with("q", "runs/b", env={"robot_uids": "fetch_at_table"}),
+    )
+    assert {row.variant for row in build_table([named, by_uid]).rows} == {None}
+    light = run_with("q", "runs/b", env={"robot_uids": "panda_wristcam_light"})
+    assert len({row.variant for row in build_table([run_with(), light]).rows}) == 2
+    other = run_with("q", "runs/b", env={"robot_uids": "of_a_package_that_is_not_installed"})
+    assert len({row.variant for row in build_table([named, other]).rows}) == 2
+
+
 def test_episodes_that_stop_at_their_first_success_have_the_same_success_once() -> None:
     assert changed(stop_at_success=True) == []
 

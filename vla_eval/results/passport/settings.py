@@ -9,6 +9,7 @@ from vla_eval.errors import TaskArgumentError, UnknownNameError
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.results.passport.fields import setting_sections
 from vla_eval.robots.find import ROBOT, ROBOT_UIDS, control_mode_of, robot_of
+from vla_eval.robots.rows import PANDA
 from vla_eval.storage.run_file import DEVICE, leaves
 from vla_eval.storage.run_folder import StoredRun
 from vla_eval.tasks.arguments import HORIZON, horizon_steps, longest_wait_steps
@@ -30,6 +31,10 @@ def settings_of(run: StoredRun) -> dict[str, str]:
     config = run.description.config
     chosen = {name: config[name] for name in setting_sections() if name in config}
     settings = {path: text.strip('"') for path, text in leaves(chosen, prefix="")}
+    name = robot_name({ROBOT_UIDS: uid}) if (uid := settings.get(f"{ENV}{ROBOT_UIDS}")) else PANDA.name
+    if name not in (PANDA.name, uid):  # the uids of the Panda differ in the mesh of its camera
+        settings[f"{ENV}{ROBOT}"] = name
+        del settings[f"{ENV}{ROBOT_UIDS}"]
     # Other weights of a policy may be another training run; another instruction is another variant.
     return settings | {name: digest[:DIGITS] for name, digest in prompts_of(run).items()}
 
