@@ -74,6 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the episodes that the test asks for, and print the verdict to standard output."""
+    from vla_eval.evaluation.resolve import resolve
     from vla_eval.results.acceptance import Acceptance, fixed_plan, plan
     from vla_eval.results.acceptance_text import render_decision, render_plan
     from vla_eval.results.claims import read_claim
@@ -84,13 +85,12 @@ def run(args: argparse.Namespace) -> int:
     most = plan(test, wanted_power=args.power, most=args.episodes)
     config = _config(args, claimed, episodes=most)
     at_end = fixed_plan(test, wanted_power=args.power, most=args.episodes)
-    print(render_plan(claimed, test, config, power=args.power, at_end=at_end), file=sys.stderr)
-    if args.dry_run:
-        return 0
-    from vla_eval.evaluation.resolve import resolve
-
     with backend_of(args) as backend:
-        stopped, n_errors, decision = _evaluate(resolve(config, backend=backend, out=args.out), args, test)
+        resolved = resolve(config, backend=backend, out=args.out)  # before a word is said
+        print(render_plan(claimed, test, config, power=args.power, at_end=at_end), file=sys.stderr)
+        if args.dry_run:
+            return 0
+        stopped, n_errors, decision = _evaluate(resolved, args, test)
     if stopped is not None:
         print(f"Stopped. To resume: {typed_command()}", file=sys.stderr)
         return stopped
