@@ -122,6 +122,12 @@ def test_a_published_row_is_a_claim_with_its_notes() -> None:
         (("100/100", "--task", COLOR, "--power", "1"), "between 0 and 1"),
         (("100/100", "--task", COLOR, "--loss", "0"), "between 0 and 1"),
         (("100/100", "--task", COLOR, "--episodes", "0"), "expected 1 to"),
+        (("100/100", "--task", COLOR, "--set", "runs=3"), "the test is of one run"),
+        (("100/100", "--task", COLOR, "--set", "n_action_steps=[1, 4]"), "a claim is of one, found 1, 4"),
+        (
+            ("100/100", "--task", COLOR, "--set", f"tasks=[{COLOR}, {SHELL}]"),
+            "--set tasks: a claim is of one",
+        ),
     ],
 )
 def test_a_mistake_is_one_message(

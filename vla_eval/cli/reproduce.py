@@ -17,7 +17,7 @@ from vla_eval.cli.shared.arguments import (
 from vla_eval.cli.shared.cluster import backend_of
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import apply_overrides
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, some_of
 from vla_eval.strict.bounds import MAX_EPISODES
 from vla_eval.strict.decoding import decode
 
@@ -123,7 +123,12 @@ def _config(args: argparse.Namespace, claimed: "Claimed", *, episodes: int) -> E
         data["n_action_steps"] = [claimed.n_action_steps]
     apply_overrides(data, args.overrides, cls=EvalConfig, free=env_paths(args.overrides))
     config = decode(EvalConfig, data, where="reproduce")
-    last = config.seed_start + episodes - 1
+    for name in ("tasks", "policies", "n_action_steps"):
+        if len(values := getattr(config, name) or ("default",)) > 1:
+            raise RecipeError(f"--set {name}: a claim is of one, found {some_of(values)}.")
+    if config.runs > 1:
+        raise RecipeError(f"--set runs={config.runs}: the test is of one run. Leave it out.")
+    last = config.seed_start + config.episodes - 1
     known = sorted(seed for seed in claimed.seeds if config.seed_start <= seed <= last)
     if known:
         raise RecipeError(
