@@ -7,6 +7,7 @@ By Ville's inequality it exceeds 1/a at any time with probability a at most, so 
 costs nothing.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -43,14 +44,18 @@ class Claim:
 
     def bounds(self, level: float) -> tuple[float, float]:
         """Return the exact bounds of the rate behind the claim, each of which fails with this probability."""
-        k, n = self.n_success, self.n_episodes
-        low = float(stats.beta.ppf(level, k, n - k + 1)) if k else 0.0
-        high = float(stats.beta.isf(level, k + 1, n - k)) if k < n else 1.0
-        return low, high
+        return _exact_bounds(self.n_success, self.n_episodes, level)
 
     def __str__(self) -> str:
         """Return `91 of 100 (0.91)`."""
         return f"{self.n_success} of {self.n_episodes} ({self.rate:.2f})"
+
+
+@functools.lru_cache(maxsize=256)  # a plan asks for the same ones at each number of episodes
+def _exact_bounds(k: int, n: int, level: float) -> tuple[float, float]:
+    low = float(stats.beta.ppf(level, k, n - k + 1)) if k else 0.0
+    high = float(stats.beta.isf(level, k + 1, n - k)) if k < n else 1.0
+    return low, high
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,8 +126,7 @@ def decide(test: Acceptance, outcomes: Sequence[bool]) -> Decision:
     """
     successes = np.cumsum(np.array(outcomes, dtype=np.int64))
     episodes = np.arange(1, len(outcomes) + 1)
-    worse = _is_shown(_log_below(successes, episodes, test.floor), test.level)
-    better = _is_shown(_log_above(successes, episodes, test.bar), test.level)
+    worse, better = _shown(test, successes, episodes)
     decided = np.flatnonzero(worse | better)
     if not len(decided):
         return Decision("open", len(outcomes), int(successes[-1]) if len(outcomes) else 0)
@@ -165,8 +169,7 @@ def _probabilities(test: Acceptance, rate: float) -> Iterator[tuple[float, float
     for n in itertools.count(1):
         undecided = np.append(undecided, 0.0) * (1 - rate) + np.append(0.0, undecided) * rate
         counts, of = np.arange(n + 1), np.full(n + 1, n)
-        worse = _is_shown(_log_below(counts, of, test.floor), test.level)
-        better = _is_shown(_log_above(counts, of, test.bar), test.level) & ~worse
+        worse, better = _shown(test, counts, of)
         below += float(undecided[worse].sum())
         reproduced += float(undecided[better].sum())
         undecided = np.where(worse | better, 0.0, undecided)
@@ -192,6 +195,14 @@ def _p_value(test: Acceptance, successes: NDArray[np.int64], episodes: NDArray[n
         else:
             low = math.log(level)
     return math.exp(high)
+
+
+def _shown(
+    test: Acceptance, successes: NDArray[np.int64], episodes: NDArray[np.int64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return where *below* is shown, and where *reproduced* is and not *below*."""
+    worse = _is_shown(_log_below(successes, episodes, test.floor), test.level)
+    return worse, _is_shown(_log_above(successes, episodes, test.bar), test.level) & ~worse
 
 
 def _is_shown(log_e: Numbers, level: float) -> NDArray[np.bool_]:
