@@ -74,6 +74,11 @@ def usual_arguments(run: StoredRun, task: str) -> dict[str, str]:
     return {f"{ENV}{name}": text for name, text in usual.items()}
 
 
+def full_settings(run: StoredRun, task: str) -> dict[str, str]:
+    """Return path -> text of the settings of a run's task: those named, and those that hold anyway."""
+    return usual_arguments(run, task) | settings_of(run)
+
+
 def robot_name(env: Mapping[str, Any]) -> str:
     """Return the robot that arguments name, or the default; as they name it if it is not installed here."""
     try:

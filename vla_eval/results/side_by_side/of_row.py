@@ -11,12 +11,12 @@ from vla_eval.results.passport.settings import (
     DIGITS,
     ENV,
     arguments_of,
+    full_settings,
     prompts_of,
     robot_name,
     settings_of,
     task_of,
     task_version,
-    usual_arguments,
 )
 from vla_eval.robots.rows import PANDA
 from vla_eval.seeding import SeedRange, seed_ranges
@@ -74,7 +74,7 @@ def passports_of(grouping: Grouping) -> dict[RowKey, Passport]:
             if run.path not in of_runs:
                 of_runs[run.path] = _values_of_run(run, settings_of(run))
             if place not in settings:
-                settings[place] = usual_arguments(run, key.task) | settings_of(run)
+                settings[place] = full_settings(run, key.task)
             row = RowOfRun(run=run, settings=settings[place], episodes=group)
             each.append(of_runs[run.path] | _values_of_row(row))
         values = {one.name: tuple(dict.fromkeys(own[one.name] for own in each)) for one in FIELDS}
@@ -140,7 +140,7 @@ def _robot(row: RowOfRun) -> str | None:
 
 def horizon_of(run: StoredRun, task: str) -> int | None:
     """Return the control steps of an episode of a task in a run; None if it is not known."""
-    steps = (usual_arguments(run, task) | settings_of(run)).get(f"{ENV}{HORIZON}")
+    steps = full_settings(run, task).get(f"{ENV}{HORIZON}")
     return None if steps is None else int(steps)
 
 
