@@ -2,9 +2,9 @@
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from vla_eval.cli.shared.arguments import MANY
 from vla_eval.cli.shared.output import add_table_arguments, imported_rows, print_in, print_table
@@ -12,6 +12,7 @@ from vla_eval.cli.terminal.screen import print_markdown
 from vla_eval.errors import ReportError, some_of
 
 if TYPE_CHECKING:
+    from vla_eval.results.success_table import Table
     from vla_eval.storage.run_folder import StoredRun
 
 DESCRIPTION = """Print the success table of one or more run folders; standard output carries nothing else.
@@ -91,34 +92,12 @@ def run(args: argparse.Namespace) -> int:
     if not args.runs:
         return _print_beside(args)
     runs = [read_run(path) for path in args.runs]
-    if args.html is not None:
-        _check_alone("--html writes a page", args)
-    if args.filmstrip is not None:
-        _check_alone("--filmstrip writes a contact sheet", args)
-    if args.export is not None:
-        _check_alone("--export writes a file", args)
-    if args.card is not None:
-        _check_alone("--card writes into a file", args)
-    if args.html is not None:
-        from vla_eval.page.build import write_page
-        from vla_eval.probe.page.sections import probe_sections
-
-        page = write_page(
-            runs,
-            args.html,
-            baseline=args.baseline,
-            probes=probe_sections(runs),
-            protocols=args.protocols,
-            published=args.published,
-        )
-        print(page)
-    if args.filmstrip is not None:
-        _write_filmstrips(runs, args.filmstrip)
-    if args.export is not None:
-        _export(runs, args)
-    if args.card is not None:
-        _write_card(runs, args)
-    if any(one is not None for one in (args.html, args.filmstrip, args.export, args.card)):
+    wanted = _wanted(args)
+    for name in wanted:
+        _check_alone(_WRITERS[name].words, args)
+    for name in wanted:
+        _WRITERS[name].write(runs, args)
+    if wanted:
         return 0
     print_table(runs, args, columns=args.columns)
     if args.format == "markdown":
@@ -132,7 +111,7 @@ def _print_beside(args: argparse.Namespace) -> int:
     from vla_eval.results.table_formats import render_beside
 
     is_none = args.published is None and not args.imported
-    if is_none or any(one is not None for one in (args.html, args.filmstrip, args.export, args.card)):
+    if is_none or _wanted(args):
         raise ReportError("Name at least one RUN, a run folder, or --published or --imported alone.")
     rows = imported_rows(args.imported)
     print_in(args.format, render_beside(args.format, published=args.published, imported=rows))
@@ -148,37 +127,76 @@ def _check_alone(written: str, args: argparse.Namespace) -> None:
         )
 
 
-def _export(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
-    from vla_eval.results.export import export_text
-    from vla_eval.results.report import build_table
-    from vla_eval.storage.durable import replace_file
+def _wanted(args: argparse.Namespace) -> list[str]:
+    """Return what is written in place of the table."""
+    return [name for name in _WRITERS if getattr(args, name) is not None]
 
-    table = build_table(runs, baseline=args.baseline, protocols=args.protocols)
-    args.export.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(args.export, export_text(table))
-    print(args.export)
+
+def _write_html(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+    from vla_eval.page.build import write_page
+    from vla_eval.probe.page.sections import probe_sections
+
+    page = write_page(
+        runs,
+        args.html,
+        baseline=args.baseline,
+        probes=probe_sections(runs),
+        protocols=args.protocols,
+        published=args.published,
+    )
+    print(page)
+
+
+def _write_filmstrips(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+    from vla_eval.page.filmstrip import N_EPISODES, write_filmstrips
+
+    made = write_filmstrips(runs, args.filmstrip)
+    print("\n".join(map(str, made.files)))
+    if made.not_captured:
+        print(f"Not captured (--capture-video {N_EPISODES}): {some_of(made.not_captured)}", file=sys.stderr)
+
+
+def _write_export(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
+    from vla_eval.results.export import export_text
+
+    _write_text(args.export, export_text(_table(runs, args)))
 
 
 def _write_card(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
     from vla_eval.results.model_card import with_results
-    from vla_eval.results.report import build_table
-    from vla_eval.storage.durable import replace_file
 
     try:
         text = args.card.read_text(encoding="utf-8") if args.card.exists() else ""
     except UnicodeDecodeError as exc:
         raise ReportError(f"{args.card}: expected a model card, found {exc}.") from exc
-    table = build_table(runs, baseline=args.baseline, protocols=args.protocols)
-    new = with_results(text, table, where=str(args.card))
-    args.card.parent.mkdir(parents=True, exist_ok=True)
-    replace_file(args.card, new)
-    print(args.card)
+    _write_text(args.card, with_results(text, _table(runs, args), where=str(args.card)))
 
 
-def _write_filmstrips(runs: "Sequence[StoredRun]", folder: Path) -> None:
-    from vla_eval.page.filmstrip import N_EPISODES, write_filmstrips
+def _table(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> "Table":
+    from vla_eval.results.report import build_table
 
-    made = write_filmstrips(runs, folder)
-    print("\n".join(map(str, made.files)))
-    if made.not_captured:
-        print(f"Not captured (--capture-video {N_EPISODES}): {some_of(made.not_captured)}", file=sys.stderr)
+    return build_table(runs, baseline=args.baseline, protocols=args.protocols)
+
+
+def _write_text(file: Path, text: str) -> None:
+    from vla_eval.storage.durable import replace_file
+
+    file.parent.mkdir(parents=True, exist_ok=True)
+    replace_file(file, text)
+    print(file)
+
+
+class _Writer(NamedTuple):
+    """What is written in place of the table, in words, and what writes it."""
+
+    words: str
+    write: "Callable[[Sequence[StoredRun], argparse.Namespace], None]"
+
+
+_WRITERS: Mapping[str, _Writer] = {
+    "html": _Writer("--html writes a page", _write_html),
+    "filmstrip": _Writer("--filmstrip writes a contact sheet", _write_filmstrips),
+    "export": _Writer("--export writes a file", _write_export),
+    "card": _Writer("--card writes into a file", _write_card),
+}
+"""By the flag, in this order."""
