@@ -147,7 +147,7 @@ def test_what_a_file_states_is_in_the_passport_and_the_rest_is_unknown(tmp_path:
     assert passport.values["control_mode"] == ("pd_ee_delta_pose",)
     assert passport.values["seeds"] == ("4242424242 to 4242424245",)
     assert passport.values["success_rule"] == ("success at any step",)
-    # What a policy says of its chunks is not what it executes.
+    # The chunk size that a policy states need not be what it executes.
     assert passport.values["n_action_steps"] == (None,) and "perhaps 1" in passport.text("n_action_steps")
     (row,) = read(tmp_path, robostats())
     assert row.passport.values["n_action_steps"] == ("8",)

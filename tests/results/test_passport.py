@@ -1,4 +1,4 @@
-"""Passports: what is known of how a figure was made, what differs, and what is therefore not ranked."""
+"""Passports: how a figure was made, as far as that is known; what differs, and so is not ranked."""
 
 import itertools
 import re
