@@ -7,7 +7,7 @@ import json
 import sys
 from pathlib import Path
 
-from vla_eval.results.export import ROW_FIELDS, export_schema
+from vla_eval.results.exported.file import ROW_FIELDS, export_schema
 from vla_eval.results.passport.fields import FIELDS
 
 SCHEMA, PAGE, START = "results.schema.json", "exported.md", "<!-- generated: scripts/results_schema.py -->"

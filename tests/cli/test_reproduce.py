@@ -9,7 +9,7 @@ import pytest
 from vla_eval.cli.main import main
 from vla_eval.cli.reproduce import outcomes
 from vla_eval.errors import RecipeError
-from vla_eval.results.claims import read_claim
+from vla_eval.results.claimed.claims import read_claim
 from vla_eval.storage.run_folder import read_run
 
 pytestmark = pytest.mark.usefixtures("in_this_process")

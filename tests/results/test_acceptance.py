@@ -7,7 +7,7 @@ import pytest
 from scipy import integrate, stats
 
 from vla_eval.errors import RecipeError
-from vla_eval.results.acceptance import (
+from vla_eval.results.claimed.acceptance import (
     Acceptance,
     Claim,
     _log_above,

@@ -10,7 +10,7 @@ import pytest
 from tests.results.stored_runs import episodes, stored
 from tests.testing.script_files import load_script
 from vla_eval.cli.main import main
-from vla_eval.results.export import ROW_FIELDS, export_schema, export_text
+from vla_eval.results.exported.file import ROW_FIELDS, export_schema, export_text
 from vla_eval.results.passport.fields import FIELDS
 from vla_eval.results.report import build_table
 from vla_eval.storage.run_folder import StoredRun

@@ -9,8 +9,8 @@ import yaml
 from tests.results.stored_runs import COLOR, INTERCEPT, episodes, stored
 from vla_eval.cli.main import main
 from vla_eval.errors import RecipeError, ReportError
-from vla_eval.results.claims import read_claim
-from vla_eval.results.model_card import results_of_card, with_results
+from vla_eval.results.claimed.claims import read_claim
+from vla_eval.results.exported.model_card import results_of_card, with_results
 from vla_eval.results.report import build_table
 from vla_eval.results.success_table import Table
 

@@ -157,13 +157,13 @@ def _write_filmstrips(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> 
 
 
 def _write_export(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
-    from vla_eval.results.export import export_text
+    from vla_eval.results.exported.file import export_text
 
     _write_text(args.export, export_text(_table(runs, args)))
 
 
 def _write_card(runs: "Sequence[StoredRun]", args: argparse.Namespace) -> None:
-    from vla_eval.results.model_card import with_results
+    from vla_eval.results.exported.model_card import with_results
 
     try:
         text = args.card.read_text(encoding="utf-8") if args.card.exists() else ""

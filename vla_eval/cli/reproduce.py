@@ -24,8 +24,8 @@ from vla_eval.strict.decoding import decode
 if TYPE_CHECKING:
     from vla_eval.evaluation.resolve import ResolvedEvaluation
     from vla_eval.records import EpisodeRecord
-    from vla_eval.results.acceptance import Acceptance, Decision
-    from vla_eval.results.claims import Claimed
+    from vla_eval.results.claimed.acceptance import Acceptance, Decision
+    from vla_eval.results.claimed.claims import Claimed
 
 DESCRIPTION = """Run a policy on fresh seeds, under the conditions of a claim, until it is known whether it is
 as good as was claimed: *reproduced* (it has lost less than --loss), *below the claim*, or *not decided*.
@@ -75,9 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the episodes that the test asks for, and print the verdict to standard output."""
     from vla_eval.evaluation.resolve import resolve
-    from vla_eval.results.acceptance import Acceptance, fixed_plan, plan
-    from vla_eval.results.acceptance_text import render_decision, render_plan
-    from vla_eval.results.claims import read_claim
+    from vla_eval.results.claimed.acceptance import Acceptance, fixed_plan, plan
+    from vla_eval.results.claimed.claims import read_claim
+    from vla_eval.results.claimed.written import render_decision, render_plan
 
     _check(args)
     claimed = read_claim(args.claim, task=args.task, n_action_steps=args.n_action_steps, of=args.of)
@@ -143,7 +143,7 @@ def _evaluate(
 ) -> "tuple[int | None, int, Decision]":
     """Run until it is decided; return the exit code if a signal came, the number of errors, the verdict."""
     from vla_eval.cli.terminal.progress import evaluate_with_progress, stop_on_signals
-    from vla_eval.results.acceptance import decide
+    from vla_eval.results.claimed.acceptance import decide
     from vla_eval.storage.folders import RUN, kind_of
     from vla_eval.storage.run_folder import read_run
 

@@ -9,9 +9,9 @@ from typing import Any  # fields of `EvalConfig`, as plain data
 from vla_eval.config.files import to_data
 from vla_eval.config.recorded_chunking import read_chunking
 from vla_eval.errors import RecipeError, some_of, unknown_name
-from vla_eval.results.acceptance import Claim
+from vla_eval.results.claimed.acceptance import Claim
+from vla_eval.results.exported.model_card import CARD, results_of_card
 from vla_eval.results.grouping import POLICY_NAMES, RowEpisodes, RowKey, group_runs
-from vla_eval.results.model_card import CARD, results_of_card
 from vla_eval.results.passport.settings import TASK_VERSIONS, task_version
 from vla_eval.results.published.literature import PublishedResult, load_published
 from vla_eval.storage.folders import RUN, kind_of

@@ -4,8 +4,8 @@ import json
 from dataclasses import asdict
 
 from vla_eval.config.evaluation import EvalConfig
-from vla_eval.results.acceptance import Acceptance, Claim, Decision
-from vla_eval.results.claims import Claimed
+from vla_eval.results.claimed.acceptance import Acceptance, Claim, Decision
+from vla_eval.results.claimed.claims import Claimed
 
 
 def render_plan(
