@@ -4,9 +4,11 @@ import gc
 import importlib.metadata
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +145,24 @@ def test_what_was_prepared_imports_before_there_is_a_worker_and_ends_with_the_co
             assert is_alive(server)
             parent.send_signal(signal.SIGKILL)
     wait_until(lambda: not is_alive(server))
+
+
+@pytest.mark.parametrize("n_killed", [1, 5])
+def test_processes_that_are_killed_while_they_ask_for_a_worker_end_nothing(n_killed: int) -> None:
+    """Between connecting and sending, a few microseconds. multiprocessing's own server would end."""
+    with worker_environment():
+        before = worker_context().Process(target=time.sleep, args=(600,))
+        before.start()
+    address = forkserver._forkserver._forkserver_address  # type: ignore[attr-defined]
+    for _ in range(n_killed):
+        with socket.socket(socket.AF_UNIX) as killed:
+            killed.connect(address)
+    after = worker_context().Process(target=os._exit, args=(7,))
+    after.start()
+    after.join(30)
+    assert after.exitcode == 7
+    assert before.is_alive()
+    before.kill()
 
 
 def test_a_worker_ends_with_a_command_that_is_killed() -> None:

@@ -1,11 +1,14 @@
 """Imported by the process that workers are forked from; see `vla_eval.workers.start`."""
 
 import contextlib
+import errno
 import functools
 import gc
 import importlib.metadata
 import os
+import socket
 from collections.abc import Iterator
+from multiprocessing import reduction
 
 from vla_eval.lock.state import code_folders
 from vla_eval.workers.guard import end_with_parent
@@ -43,7 +46,23 @@ def _packages_asked_for_once() -> Iterator[None]:
         setattr(importlib.metadata, "packages_distributions", original)  # noqa: B010
 
 
+_receive = reduction.recvfds
+
+
+def _receive_or_wait_for_the_next(sock: socket.socket, size: int) -> list[int]:
+    """Receive what a process sends that asks for a worker.
+
+    If it was killed before it could send, multiprocessing's server would end, with a traceback. An aborted
+    connection is the one thing after which it waits for the next.
+    """
+    try:
+        return _receive(sock, size)
+    except EOFError as exc:
+        raise ConnectionAbortedError(errno.ECONNABORTED, "it was killed before it could send") from exc
+
+
 if IMPORTS_VARIABLE in os.environ:  # else this module is imported for its names
     end_with_parent(int(os.environ[PARENT_VARIABLE]))
     os.setsid()  # signals to the command's group are for the command, which then ends its workers
     import_for_workers()
+    reduction.recvfds = _receive_or_wait_for_the_next
