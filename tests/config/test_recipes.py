@@ -160,7 +160,7 @@ class TestFinding:
         tables = [name for name in list_recipes("configs") if is_model_table(name)]
         assert tables == [load_model_table(name).name for name in tables]
         papers = ["paper_offline_small", "paper_offline_table", "paper_vla_table"]
-        assert tables == ["ablations", "memory_table", *papers]
+        assert tables == ["ablations", "baselines", "memory_table", *papers]
         trainings = {name for name in list_recipes("configs") if is_agent_table(name)}
         assert trainings == {"base_table"}
         for name in list_recipes("configs").keys() - {*tables, *trainings}:
