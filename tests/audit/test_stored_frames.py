@@ -8,13 +8,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vla_eval.audit.frame_probes import best_option
-from vla_eval.audit.readings import READINGS, colours, pixels, places
+from vla_eval.audit.frame_probes import FrameProbes, best_option
+from vla_eval.audit.readings import READINGS, background, colours, pixels, places
 from vla_eval.audit.stored_frames import _row, fewest_frames, verdict
 from vla_eval.cli.main import main
 from vla_eval.evaluation.memory_log import EpisodeMemory
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.shipped_audit import ONE, SEVERAL, UNREAD
+from vla_eval.tasks.catalog import OFFICIAL_TASKS
+from vla_eval.tasks.spec import TaskSpec
 
 pytestmark = pytest.mark.usefixtures("in_this_process")
 
@@ -89,6 +91,50 @@ def test_the_fewest_frames_that_show_all_that_is_right(
     assert fewest_frames(shown(*steps), remembered(*right)) == expected
 
 
+@pytest.mark.parametrize(
+    ("steps", "right", "expected"),
+    [
+        ([(0, 2, 3, 4), ()], (1,), 1),  # all others at once
+        ([(0, 2), (3, 4), ()], (1,), 2),  # in turn
+        ([(0, 2, 3), ()], (1,), None),  # one of the others is never shown: it may be that one
+        ([(0, 1, 2, 3, 4)], (1,), 1),
+    ],
+)
+def test_what_a_cue_leaves_out_is_told_by_all_others(
+    steps: list[tuple[int, ...]], right: tuple[int, ...], expected: int | None
+) -> None:
+    assert fewest_frames(shown(*steps), remembered(*right), left_out=True) == expected
+
+
+def test_each_episode_has_its_own_first_frame_and_end_of_the_cue() -> None:
+    lengths = {seed: (2 + seed % 3, 1 + seed % 2) for seed in range(6)}  # steps of the cue, and of the delay
+
+    def memory(seed: int) -> EpisodeMemory:
+        cue, delay = lengths[seed]
+        levels = [10 + step for step in range(cue)] + [100 + step for step in range(delay)] + [200]
+        frames = np.array([np.full((8, 8, 3), level, np.uint8) for level in levels])
+        steps = np.arange(len(levels))
+        return EpisodeMemory(steps=steps, memory={}, frames={"base_camera": frames}, in_cue=steps < cue)
+
+    memories = [memory(seed) for seed in lengths]
+    found = FrameProbes.of(memories, [(seed % 2,) for seed in lengths], list(lengths))
+    pixel = found.features[0][0][:, :, 0]  # of the reading `pixels`
+    assert (pixel[:, found.newest] == 200).all()
+    assert (pixel[:, found.first] == 10).all()
+    assert pixel[:, found.cue_end].tolist() == [10 + cue - 1 for cue, _ in lengths.values()]
+    # Between them the frames are those before the newest, as many as the shortest episode has.
+    assert not found.is_aligned and found.own == (found.first, found.cue_end)
+    assert found.newest == min(map(sum, lengths.values()))
+    assert pixel[:, found.newest - 1].tolist() == [100 + delay - 1 for _, delay in lengths.values()]
+
+
+@pytest.mark.parametrize("spec", [one for one in OFFICIAL_TASKS.values() if one.has_candidates])
+def test_what_the_cue_of_an_official_task_says(spec: TaskSpec) -> None:
+    assert spec.cue_leaves_out == ("Imposter" in spec.id)
+    assert spec.is_tracked == ("Shuffle" in spec.id)
+    assert spec.has_alike_candidates == ("ShellGame" in spec.id)
+
+
 def test_without_the_true_state_it_is_not_known() -> None:
     assert fewest_frames(None, remembered(1)) is None
 
@@ -100,7 +146,7 @@ def test_colours_do_not_depend_on_the_place_and_places_do(seed: int) -> None:
     colour = rng.integers(0, 256, 3)
     for episode, (row, column) in enumerate(rng.integers(0, 7, (5, 2)) * 4):
         frames[episode, 0, row : row + 4, column : column + 4] = colour
-    found = {name: read(frames) for name, read in READINGS.items()}
+    found = {name: read(frames, background(frames)) for name, read in READINGS.items()}
     assert found["colours"].shape == (6, 2, 125) and found["places"].shape == (6, 2, 9 * 64)
     if np.abs(colour.astype(int) - 90).sum() > 40:
         # 16 pixels of one colour, in one block: the root is 4 wherever they are.
@@ -108,7 +154,7 @@ def test_colours_do_not_depend_on_the_place_and_places_do(seed: int) -> None:
         assert (found["places"][:5, 0].max(axis=1) == 4).all()
         assert (found["colours"][:5, 0] == found["colours"][0, 0]).all()
     assert not found["colours"][:, 1].any() and not found["places"][5].any()  # nothing there but the table
-    assert (pixels(frames)[..., :3] == frames[:, :, 0, 0]).all()
+    assert (pixels(frames, background(frames))[..., :3] == frames[:, :, 0, 0]).all()
 
 
 def test_each_hue_and_each_grey_has_a_bin_of_its_own() -> None:
@@ -117,8 +163,8 @@ def test_each_hue_and_each_grey_has_a_bin_of_its_own() -> None:
     frames = np.full((19, 1, 8, 8, 3), 200, np.uint8)
     for episode, rgb in enumerate(named):
         frames[episode, 0, 0, 0] = rgb
-    assert sorted(places(frames)[:9, 0].argmax(axis=1) // 64) == list(range(9))
-    assert len(set(colours(frames)[:9, 0].argmax(axis=1))) == 9
+    assert sorted(places(frames, background(frames))[:9, 0].argmax(axis=1) // 64) == list(range(9))
+    assert len(set(colours(frames, background(frames))[:9, 0].argmax(axis=1))) == 9
 
 
 def audit(folder: Path, capsys: pytest.CaptureFixture[str], *arguments: str) -> list[dict[str, Any]]:

@@ -2,11 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from vla_eval.audit.readings import READINGS, Features
+from vla_eval.audit.readings import READINGS, Features, background
 from vla_eval.evaluation.memory_log import EpisodeMemory
 from vla_eval.results.linear_probe import Vectors, folds_of, kernels, predicted_from
 
@@ -17,11 +18,15 @@ Right = NDArray[np.bool_]  # (N,) in which episodes
 class FrameProbes:
     """Linear probes on the frames of one task, aligned at the first frame of the response, the newest.
 
+    Where the response does not begin at the same step in all episodes, the first frame of each and the last
+    of its cue are not aligned: they have numbers of their own, after the newest.
+
     A probe is right if it is right in everything that is asked. Each episode is predicted by probes that are
     fitted on the episodes of other seeds.
     """
 
-    n_steps: int
+    newest: int  # number of the frame
+    is_aligned: bool  # whether the cue is shown at the same steps in all episodes
     cue: tuple[int, ...]  # steps at which the cue is shown, in any episode
     features: tuple[tuple[Features, ...], ...]  # of each reading: of each camera (N, T, D)
     answers: NDArray[np.int64]  # (N, L)
@@ -36,15 +41,33 @@ class FrameProbes:
         """Return the probes of these episodes."""
         n_steps = min(len(memory.steps) for memory in memories)
         cameras = sorted(memories[0].frames)
-        frames = [np.array([memory.frames[name][-n_steps:] for memory in memories]) for name in cameras]
+        frames = [np.array([_aligned(one, name, n_steps) for one in memories]) for name in cameras]
         in_cue = [memory.in_cue[-n_steps:] for memory in memories if memory.in_cue is not None]
         return cls(
-            n_steps=n_steps,
+            newest=n_steps - 1,
+            is_aligned=len({bytes(_cue_of(one)) for one in memories}) == 1,
             cue=tuple(np.flatnonzero(np.any(in_cue, axis=0)[:-1]).tolist()) if in_cue else (),
-            features=tuple(tuple(map(read, frames)) for read in READINGS.values()),
+            features=tuple(
+                tuple(read(one, background(one[:, :n_steps])) for one in frames) for read in READINGS.values()
+            ),
             answers=np.array(labels),
             folds=folds_of(seeds),
         )
+
+    @property
+    def first(self) -> int:
+        """Number of the first frame of each episode."""
+        return self.newest + 1
+
+    @property
+    def cue_end(self) -> int:
+        """Number of the last frame of each episode's cue; without a cue, of the last before the newest."""
+        return self.newest + 2
+
+    @property
+    def own(self) -> tuple[int, ...]:
+        """The numbers of the two, where they are not among those before the newest."""
+        return () if self.is_aligned else (self.first, self.cue_end)
 
     def best_of(self, choices: Sequence[tuple[int, ...]]) -> tuple[Right, int]:
         """Return in which episodes the best of some choices of steps is right, and the last step of it.
@@ -84,6 +107,19 @@ class FrameProbes:
         told = [predicted_from(kernel, column, self.folds) == column for column in self.answers.T]
         right: Right = np.all(told, axis=0)
         return right
+
+
+def _aligned(memory: EpisodeMemory, camera: str, n_steps: int) -> NDArray[Any]:
+    """Return (n_steps + 2, px, px, 3): the last frames, then the first and the last of the cue."""
+    frames = memory.frames[camera]
+    cue = np.flatnonzero(_cue_of(memory)[:-1])
+    cue_end = int(cue[-1]) if len(cue) else max(len(frames) - 2, 0)
+    return np.concatenate([frames[-n_steps:], frames[[0, cue_end]]])
+
+
+def _cue_of(memory: EpisodeMemory) -> NDArray[np.bool_]:
+    """Return (T,) whether the cue is shown; False where it is not known."""
+    return np.zeros(len(memory.steps), dtype=bool) if memory.in_cue is None else memory.in_cue
 
 
 def best_option(by_option: NDArray[np.bool_], folds: NDArray[np.int64]) -> tuple[Right, int]:

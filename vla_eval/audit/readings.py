@@ -1,7 +1,7 @@
 """What a linear probe is given of small frames: their pixels, their colours, or colours by place.
 
 Pixels tell what lies at a fixed place. Colours are counted wherever they are, so they tell which things are
-in view; colours by place tell where things of a colour are. Pure functions of frames.
+in view; colours by place tell where things of a colour are. Pure functions of frames and their background.
 """
 
 from collections.abc import Callable, Mapping
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 Frames = NDArray[np.uint8]  # (N, T, px, px, 3): episodes, control steps
 Features = NDArray[np.float32]  # (N, T, D)
+Background = NDArray[np.float32]  # (px, px, 3)
 
 LEVELS = 5  # of each of red, green and blue
 BLOCKS = 8  # per side of an image
@@ -20,43 +21,43 @@ LIGHTNESS = (0.35, 0.7)  # between dark, middle and light
 N_HUES = 6
 
 
-def background(frames: Frames) -> NDArray[np.float32]:
-    """Return (px, px, 3), the median over episodes and control steps."""
-    median: NDArray[np.float32] = np.median(frames.reshape(-1, *frames.shape[2:]), axis=0).astype(np.float32)
+def background(frames: Frames) -> Background:
+    """Return the median over episodes and control steps."""
+    median: Background = np.median(frames.reshape(-1, *frames.shape[2:]), axis=0).astype(np.float32)
     return median
 
 
-def pixels(frames: Frames) -> Features:
+def pixels(frames: Frames, _behind: Background) -> Features:
     """Return every number of each frame."""
     flat: Features = frames.reshape(*frames.shape[:2], -1).astype(np.float32)
     return flat
 
 
-def colours(frames: Frames) -> Features:
+def colours(frames: Frames, behind: Background) -> Features:
     """Return how many pixels of the foreground have each of 125 colours: square roots (Hellinger)."""
     level = frames.astype(np.int64) * LEVELS // 256
     colour = (level[..., 0] * LEVELS + level[..., 1]) * LEVELS + level[..., 2]
-    return _counts(colour, LEVELS**3, _foreground(frames))
+    return _counts(colour, LEVELS**3, _foreground(frames, behind))
 
 
-def places(frames: Frames) -> Features:
+def places(frames: Frames, behind: Background) -> Features:
     """Return how many pixels of the foreground have each of nine colours in each of 8 x 8 blocks."""
     side = frames.shape[2]
     block = np.arange(side) * BLOCKS // side
     cell = block[:, None] * BLOCKS + block[None, :]
-    return _counts(_hue(frames) * BLOCKS**2 + cell, (N_HUES + 3) * BLOCKS**2, _foreground(frames))
+    return _counts(_hue(frames) * BLOCKS**2 + cell, (N_HUES + 3) * BLOCKS**2, _foreground(frames, behind))
 
 
-READINGS: Mapping[str, Callable[[Frames], Features]] = {
+READINGS: Mapping[str, Callable[[Frames, Background], Features]] = {
     "pixels": pixels,
     "colours": colours,
     "places": places,
 }
 
 
-def _foreground(frames: Frames) -> NDArray[np.bool_]:
+def _foreground(frames: Frames, behind: Background) -> NDArray[np.bool_]:
     """Return (N, T, px, px), where a frame differs from the background."""
-    away = np.abs(frames.astype(np.float32) - background(frames)).sum(axis=-1)
+    away = np.abs(frames.astype(np.float32) - behind).sum(axis=-1)
     differs: NDArray[np.bool_] = away > DIFFERS
     return differs
 

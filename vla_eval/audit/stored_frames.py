@@ -24,10 +24,11 @@ from vla_eval.evaluation.memory_log import EpisodeMemory
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import PairCounts, Share, mcnemar_exact, p_above
 from vla_eval.results.printed_table import Column, PrintedTable, cells_of, write_tables
-from vla_eval.results.shipped_audit import ONE, SEVERAL, UNREAD, Asked, StoredFrames
+from vla_eval.results.shipped_audit import INTEGRATED, ONE, SEVERAL, UNREAD, Asked, StoredFrames
 from vla_eval.storage.capture_files import frames_file
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.spec import TaskSpec
 
 NAME = "audit_stored_frames"
 CONTROL = "oracle"
@@ -45,7 +46,7 @@ def stored_frames_config(
     settings: Mapping[str, Any],  # Any: other fields of `EvalConfig`
 ) -> EvalConfig:
     """Return the evaluation whose frames are read; a `RecipeError` without a task that shows something."""
-    shown = tuple(task for task in tasks if task_spec(task).candidates is not None)
+    shown = tuple(task for task in tasks if task_spec(task).has_candidates)
     if not shown:
         raise RecipeError(
             "--stored-frames: expected a task that shows candidates to be remembered, found "
@@ -81,54 +82,69 @@ def read_stored_frames(config: EvalConfig, out: Path) -> list[StoredFrames]:
                 f"{run.path}: {task}: expected frames of at least {LEAST_EPISODES} episodes, found "
                 f"{len(episodes)} of {len(records)}. Ask for more with --episodes."
             )
-        several = task_spec(task).several_right
-        asked: tuple[Asked, ...] = ("item",)
-        if several:
-            asked = ("set", "order") if task_spec(task).shows_one_by_one else ("set",)
-        rows += [_row(task, one, episodes) for one in asked]
+        rows += [_row(task, one, episodes) for one in _asked(task_spec(task))]
     return rows
 
 
+def _asked(task: TaskSpec) -> tuple[Asked, ...]:
+    if task.several_right:
+        return ("set", "order") if task.shows_one_by_one else ("set",)
+    return ("place",) if task.has_alike_candidates else ("item",)
+
+
 def _row(task: str, asked: Asked, episodes: Sequence[tuple[EpisodeRecord, EpisodeMemory]]) -> StoredFrames:
+    spec = task_spec(task)
     labels = [_answers(record, asked) for record, _ in episodes]
     probes = FrameProbes.of(
         [memory for _, memory in episodes], labels, [record.seed for record, _ in episodes]
     )
-    newest, earlier = probes.n_steps - 1, range(probes.n_steps - 1)
+    newest, earlier = probes.newest, range(probes.newest)
     cue = probes.cue or tuple(earlier)
-    best, best_step = probes.best_of([(newest, step) for step in _spread(earlier)])
-    everything = probes.everything([*_spread(cue), newest])
+    best, best_step = probes.best_of([(newest, step) for step in (*_spread(earlier), *probes.own)])
+    everything = probes.everything([*_spread(cue), *probes.own, newest])
     chance = max(labels.count(one) for one in set(labels)) / len(labels)
     found = verdict(best, everything, chance)
-    n_frames = _most([fewest_frames(memory.shown, record) for record, memory in episodes])
+    frames = [fewest_frames(one.shown, record, left_out=spec.cue_leaves_out) for record, one in episodes]
+    n_frames = None if spec.is_tracked else _most(frames)
     return StoredFrames(
         task=task,
-        version=task_spec(task).version,
+        version=spec.version,
         asked=asked,
         n_episodes=len(episodes),
         chance=chance,
         newest=_n(probes.best_of([(newest,)])[0]),
-        first=_n(probes.best_of([(newest, 0)])[0]),
-        cue_end=_n(probes.best_of([(newest, cue[-1])])[0]),
+        first=_n(probes.best_of([(newest, probes.first)])[0]),
+        cue_end=_n(probes.best_of([(newest, probes.cue_end)])[0]),
         best=_n(best),
-        best_step=best_step,
+        best_step=best_step if best_step < newest else None,
         all=_n(everything),
         n_frames=n_frames,
         probes=found,
-        verdict=found if n_frames is None or found == SEVERAL else ONE if n_frames == 1 else SEVERAL,
+        verdict=INTEGRATED if spec.is_tracked else _of_both(found, n_frames),
     )
 
 
-def fewest_frames(shown: NDArray[np.bool_] | None, record: EpisodeRecord) -> int | None:
+def _of_both(probes: str, n_frames: int | None) -> str:
+    if n_frames is None or probes == SEVERAL:
+        return probes
+    return ONE if n_frames == 1 else SEVERAL
+
+
+def fewest_frames(
+    shown: NDArray[np.bool_] | None, record: EpisodeRecord, *, left_out: bool = False
+) -> int | None:
     """Return how many frames it takes to see all that is right; None if that is not known, or never shown.
 
     Args:
         shown: (T, N) which candidates' cues are in view at each step.
         record: the episode, whose right candidates are asked for.
+        left_out: the right ones are told by seeing all others.
     """
     right = frozenset(record.right_candidates or ())
     if shown is None or not right:
         return None
+    if left_out:
+        right = frozenset(range(shown.shape[1])) - right
     sets = {frozenset(np.flatnonzero(row).tolist()) for row in shown}
     for n in range(1, len(sets) + 1):
         if any(right <= frozenset().union(*some) for some in itertools.combinations(sets, n)):
@@ -174,6 +190,8 @@ def render_stored_frames(rows: Sequence[StoredFrames], style: Literal["markdown"
 
 def _answers(record: EpisodeRecord, asked: Asked) -> tuple[int, ...]:
     """Return what the probes have to tell, a number each."""
+    if asked == "place":
+        return (-1 if record.target_place is None else record.target_place,)
     if asked == "item":
         return (-1 if record.target is None else record.target,)
     right = record.right_candidates or ()
@@ -204,7 +222,7 @@ _COLUMNS: tuple[Column[StoredFrames], ...] = (
     Column("first + newest", lambda row: _share(row.first, row)),
     Column("cue's last + newest", lambda row: _share(row.cue_end, row)),
     Column("best + newest", lambda row: _share(row.best, row)),
-    Column("step", lambda row: str(row.best_step)),
+    Column("step", lambda row: "—" if row.best_step is None else str(row.best_step)),
     Column("all", lambda row: _share(row.all, row)),
     Column("frames that show it", lambda row: "—" if row.n_frames is None else str(row.n_frames)),
     Column("probes", lambda row: row.probes, is_number=False),

@@ -240,8 +240,6 @@ class OfficialEpisode:
         if row.true_state == "none":
             return None
         right = () if candidates is None else (candidates.target,)
-        # The imposter is what the cue leaves out.
-        is_shown = self.phase == "cue" and "/FindImposter" not in row.id
         tcp = env.agent.tcp
         return PrivilegedState(
             phase=self.phase,
@@ -251,8 +249,17 @@ class OfficialEpisode:
             gripper_width_m=float(env.agent.robot.get_qpos()[0, -2:].sum()),
             candidate_positions_m=np.zeros((0, 3)) if candidates is None else candidates.positions_m,
             right_candidates=right,
-            shown_candidates=right if is_shown else (),
+            shown_candidates=self._shown() if self.phase == "cue" else (),
             touched_candidates=tuple(self._choices.chosen),
             bodies=read_bodies(row, env, candidates, self._first),
             tcp_yaw_rad=float(yaw_rad(to_array(tcp.pose.q))[0]),
         )
+
+    def _shown(self) -> tuple[int, ...]:
+        """Return whose cue is in view while the cue is shown."""
+        if self.candidates is None:
+            return ()
+        if self._row.cue_leaves_out:
+            others = range(len(self.candidates.positions_m))
+            return tuple(index for index in others if index != self.candidates.target)
+        return (self.candidates.target,)

@@ -155,13 +155,16 @@ class FrameLog(NpzLog):
 
     def _keep(self, slot: int, result: StepResult) -> None:
         log, seen = self._logs[slot], result.observation
+        # Where an environment does not show its phase to the outside, its true state has it.
+        state = seen.privileged if isinstance(seen.privileged, PrivilegedState) else None
+        phase = result.status.phase if state is None else state.phase
         log.steps.append(seen.step)
-        log.in_cue.append(result.status.phase == "cue")
+        log.in_cue.append(phase == "cue")
         log.frames.append({camera: small(image, LARGER_FRAME_PX) for camera, image in seen.images.items()})
-        if isinstance(seen.privileged, PrivilegedState):
-            candidates = np.arange(len(seen.privileged.candidate_positions_m))
-            log.shown.append(np.isin(candidates, seen.privileged.shown_candidates))
-        if result.status.phase == "response":
+        if state is not None:
+            candidates = np.arange(len(state.candidate_positions_m))
+            log.shown.append(np.isin(candidates, state.shown_candidates))
+        if phase == "response":
             self._waiting.discard(slot)
 
 

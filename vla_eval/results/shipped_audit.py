@@ -59,14 +59,17 @@ OTHER_VERDICTS: Mapping[str, str] = {
 """A verdict without a shortcut -> its words in a note."""
 
 ONE, SEVERAL = "one stored frame is enough", "several stored frames"
+INTEGRATED = "must be integrated over time"
 UNREAD = "not read by linear probes"
 STORED: Mapping[str, str] = {
     ONE: "one stored frame is enough to remember the cue of",
     SEVERAL: "it takes several stored frames to remember the cue of",
+    INTEGRATED: "no stored frames are enough, what is seen must be integrated over time in",
 }
 """A verdict about what has to be stored -> its words in a note, before the tasks."""
-Asked = Literal["item", "set", "order"]
-"""Of `StoredFrames`: the item; the set of items; the items in the order shown."""
+Asked = Literal["item", "place", "set", "order"]
+"""Of `StoredFrames`: the item; its place at the end, among alike ones; the set of items; the items in the
+order shown."""
 
 FILE = Path(__file__).with_suffix(".json")
 OBJECTS_FILE = FILE.with_name("objects_audit.json")
@@ -120,7 +123,8 @@ class StoredFrames:
     first: Count  # from the first frame and the newest
     cue_end: Count  # from the last frame of the cue and the newest
     best: Count  # from the newest and the best other one, which the other folds choose
-    best_step: Count  # the one that most folds choose
+    # the one that most folds choose; None: the first frame or the cue's last, at another step in each episode
+    best_step: Count | None
     all: Count  # from all frames
     n_frames: Count | None  # the fewest that show it, in the episode that takes most; None if not known
     probes: str  # the verdict of the probes alone

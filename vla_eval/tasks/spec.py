@@ -72,6 +72,7 @@ class TaskSpec:
     chance_success: float | None
     idle_success: float = 0.0  # measured success rate of doing nothing; 0 for all tasks but a few
     cue_marks_place: bool = False  # the cue is shown where the right candidate will be
+    cue_leaves_out: bool = False  # the right candidate is the one that the cue does not show
     shows_one_by_one: bool = False  # the cue is `n_shown` items one after another, each for `cue_steps`
     # arguments required to make a task of this row; empty except for a family
     open_arguments: tuple[str, ...] = ()
@@ -112,6 +113,16 @@ class TaskSpec:
     def has_candidates(self) -> bool:
         """Whether one or more of N objects have to be chosen, and which they are is known to controls."""
         return bool(self.candidate_counts)
+
+    @property
+    def has_alike_candidates(self) -> bool:
+        """Whether the candidates are mugs: nothing but their places tells one from another."""
+        return "mugs" in (self.candidates, self.true_state)
+
+    @property
+    def is_tracked(self) -> bool:
+        """Whether the candidates change places after the cue, in view: each move has to be followed."""
+        return "tracking" in self.memory_types
 
     @property
     def is_official(self) -> bool:

@@ -52,7 +52,8 @@ def control_fields(name: str) -> dict[str, Any]:
     for prefix, controls in _CHOICES.items():
         if task.startswith(prefix):
             n = n_candidates(task)
-            return {**_control_row(*controls), "candidate_counts": {"n_items": n}, "chance_success": 1 / n}
+            row = _control_row(*controls) | {"cue_leaves_out": prefix == "FindImposter"}
+            return {**row, "candidate_counts": {"n_items": n}, "chance_success": 1 / n}
     for prefix, true_state in _MOVING.items():
         if task.startswith(prefix):
             own, speeds = _OWN[task], _speeds(task)
