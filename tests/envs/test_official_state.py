@@ -91,11 +91,11 @@ def test_the_first_item_at_which_the_arm_rests_is_the_first_choice() -> None:
     assert status.candidate_places == (0, 1, 2)  # from the right as the robot sees it: -y
 
 
-def test_the_imposter_is_the_right_item_and_is_not_shown() -> None:
+def test_the_imposter_is_the_right_item_and_the_cue_shows_all_others() -> None:
     places = {key: torch.tensor([[0.0, 0.1 * key, 0.02, 1, 0, 0, 0]]) for key in range(3)}
     env = with_items(_manip_raw_poses=places, imposter_key=torch.tensor([2]))
     state = OfficialEpisode(row("FindImposterColor3"), env).true_state()
-    assert state is not None and (state.target, state.shown_candidates) == (2, ())
+    assert state is not None and (state.target, state.shown_candidates) == (2, (0, 1))
     np.testing.assert_allclose(state.candidate_positions_m, [[0, 0, 0.02], [0, 0.1, 0.02], [0, 0.2, 0.02]])
 
 
