@@ -67,6 +67,7 @@ def build_page(
         latency=machine_sections.latency(material),
         errors=machine_sections.errors_table(material),
         videos=machine_sections.videos(material),
+        passport=machine_sections.passport(material),
         reproductions=[machine_sections.reproduction(run) for run in material.runs],
         # `<` is escaped as JSON does it, so that no text in it can end the element.
         report=Markup(render(material.table, "json", published=published).replace("<", "\\u003c")),

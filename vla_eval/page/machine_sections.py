@@ -1,4 +1,4 @@
-"""The page's sections on time, errors, videos and how to reproduce a run."""
+"""The page's sections on time, errors, videos, how a run was made and how to reproduce it."""
 
 import base64
 import json
@@ -12,7 +12,9 @@ from vla_eval.page.material import Material
 from vla_eval.page.tables import page_table
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.notes import UNCOMMITTED, has_uncommitted_changes
+from vla_eval.results.passport.passport import merged
 from vla_eval.results.printed_table import UNDEFINED, PrintedTable
+from vla_eval.results.side_by_side.written import passport_table
 from vla_eval.storage.capture_files import thumbnail_file, video_file
 from vla_eval.storage.run_file import JsonValue, leaves
 from vla_eval.storage.run_folder import StoredRun
@@ -30,6 +32,11 @@ class LatencyTable:
 
     table: PrintedTable
     n_unknown: int
+
+
+def passport(material: Material) -> PrintedTable:
+    """Return how the rows were made; where they differ, each value once."""
+    return passport_table([merged(list(material.table.passports.values()), subject="value")])
 
 
 def latency(material: Material) -> LatencyTable:

@@ -70,14 +70,17 @@ def render_passports(figures: Sequence[Figure], fmt: Format) -> Rendered:
             "notes": notes,
         }
         return Rendered(json.dumps(data, indent=2, ensure_ascii=False, allow_nan=False), notes)
-    table = _table(passports, found, notes)
+    table = passport_table(passports, found, notes)
     if fmt == "csv":
         rows = [dict(zip(table.titles, row, strict=True)) for row in table.rows]
         return Rendered(csv_text(table.titles, rows), notes)
     return Rendered(write_tables([table], fmt), notes)
 
 
-def _table(passports: Sequence[Passport], found: Sequence[Difference], notes: Sequence[str]) -> PrintedTable:
+def passport_table(
+    passports: Sequence[Passport], found: Sequence[Difference] = (), notes: Sequence[str] = ()
+) -> PrintedTable:
+    """Return a row per field, and a column per passport; of two, also whether they agree but for `found`."""
     marks = {one.field.name: "differs" if one.is_known else UNKNOWN for one in found}
     columns: list[Column[Field]] = [Column("field", lambda one: one.words, is_number=False)]
     for number, passport in enumerate(passports):
