@@ -50,18 +50,24 @@ def allenai() -> dict[str, Any]:
 
 
 def official() -> dict[str, Any]:
-    """As mikasa-robo-suite 1.0.0 writes the file of a task."""
+    """As mikasa-robo-suite 1.0.0 writes the file of a task: the fields of one that its runner wrote."""
     return {
         "env_id": "RememberColor3-VLA-v0",
         "split": "Short",
+        "memory_type": "object",
         "start_seed": 4242424242,
         "n_episodes": 4,
         "successes": [True, True, True, False],
+        "returns": [1.0842565782368183, 0.11475700698792934, 0.5033348128199577, 0.0],
         "sr": 0.75,
+        "mean_return": 0.4255870983487739,
         "benchmark_commit": None,
         "control_mode": "pd_ee_delta_pose",
+        "obs_mode": "rgb",
+        "wrapper_chain": "apply_mikasa_vla_wrappers(include_overlays=False)",
         "action_chunk_size": 1,
         "model": {"name": "mine", "steps": 5},
+        "episode_lengths": [25, 25, 25, 25],
         "episode_seeds": [4242424242, 4242424243, 4242424244, 4242424245],
     }
 
