@@ -8,7 +8,7 @@ import pytest
 from tests.storage.run_records import describe, error, result
 from vla_eval.errors import MergeError
 from vla_eval.records import EpisodeKey, EpisodeTiming
-from vla_eval.storage.capture_files import video_file
+from vla_eval.storage.capture_files import EPISODE_FILES
 from vla_eval.storage.merging import merge_runs, write_merged
 from vla_eval.storage.run_file import RunFile
 from vla_eval.storage.run_folder import RunFolder, read_run
@@ -58,15 +58,17 @@ def test_a_merged_run_is_continued_as_a_whole_one(tmp_path: Path) -> None:
 
 def test_captures_are_linked_and_stay_with_their_shard(tmp_path: Path) -> None:
     shards = [write_shard(tmp_path, number) for number in (1, 2)]
-    video = video_file(shards[1], result(3))
-    video.parent.mkdir()
-    video.write_bytes(b"video of seed 3")
+    captured = [one(shards[1], result(3)) for one in EPISODE_FILES]
+    for file in captured:
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(b"of seed 3")
 
     write_merged(merge_runs(shards), tmp_path / "out")
 
-    merged = video_file(tmp_path / "out", result(3))
-    assert merged.samefile(video)
-    assert [path.name for path in merged.parent.iterdir()] == [video.name]
+    merged = [one(tmp_path / "out", result(3)) for one in EPISODE_FILES]
+    assert all(one.samefile(other) for one, other in zip(merged, captured, strict=True))
+    folders = {path.parent for path in merged}
+    assert {path for folder in folders for path in folder.iterdir()} == set(merged)
 
 
 def test_the_same_shard_twice_is_refused_and_both_are_named(tmp_path: Path) -> None:

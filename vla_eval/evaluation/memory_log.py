@@ -2,7 +2,7 @@
 
 import os
 import zipfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,8 +22,7 @@ from vla_eval.core import (
 )
 from vla_eval.errors import RunFolderError
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.capture_files import frames_file, memory_file
-from vla_eval.storage.folders import FRAMES, MEMORIES
+from vla_eval.storage.capture_files import EpisodeFile, frames_file, memory_file
 from vla_eval.task_state import PrivilegedState
 
 FRAME_PX, LARGER_FRAME_PX = 16, 32
@@ -91,14 +90,14 @@ class _Log:
 class NpzLog(StepObserver):
     """A `StepObserver` that keeps arrays of each episode, and writes a file of each once it has a record."""
 
-    def __init__(self, folder: str, file: Callable[[Path, EpisodeRecord], Path]) -> None:
-        """Files go into this folder of a run folder, and are named by `file`; none before `write`."""
-        self._folder, self._file = folder, file
+    def __init__(self, file: EpisodeFile) -> None:
+        """Nothing is written before `write`."""
+        self._file = file
         self._logs: dict[int, _Log] = {}
 
     def write(self, starts: Sequence[EpisodeStart], records: Sequence[EpisodeRecord], run: Path) -> None:
         """Write the file of each episode into a run folder, whole or not at all."""
-        (run / self._folder).mkdir(exist_ok=True)
+        (run / self._file.folder).mkdir(exist_ok=True)
         for start, record in zip(starts, records, strict=True):
             _write(self._logs[start.slot], self._file(run, record))
 
@@ -108,7 +107,7 @@ class MemoryLog(NpzLog):
 
     def __init__(self, policy: RememberingPolicy) -> None:
         """Nothing is written before `write`."""
-        super().__init__(MEMORIES, memory_file)
+        super().__init__(memory_file)
         self._policy = policy
         self._newest: dict[int, Observation] = {}
 
@@ -135,7 +134,7 @@ class FrameLog(NpzLog):
 
     def __init__(self) -> None:
         """Nothing is written before `write`."""
-        super().__init__(FRAMES, frames_file)
+        super().__init__(frames_file)
         self._waiting: set[int] = set()  # slots before the response
 
     def wants_images(self, step: int) -> bool:

@@ -1,9 +1,32 @@
-"""What the files of an episode that was captured are called: video, rerun file, strip, memory, frames."""
+"""The files of an episode that was captured, a row each, and what they are called."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.storage.folders import FRAMES, MEMORIES, RRDS, STRIPS, VIDEOS
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeFile:
+    """One kind of file: the folder of a run folder that it is in, and how its name ends."""
+
+    folder: str
+    ending: str
+
+    def __call__(self, run: Path, record: EpisodeRecord) -> Path:
+        """Return where the file of an episode is, or would be, in a run folder."""
+        return run / self.folder / f"{capture_stem(record)}{self.ending}"
+
+
+video_file = EpisodeFile("videos", ".mp4")
+thumbnail_file = EpisodeFile("videos", ".jpg")  # the cue and the choice
+stills_file = EpisodeFile("videos", "_stills.jpg")  # cue, reveal, touch
+rrd_file = EpisodeFile("rrd", ".rrd")  # for the rerun viewer
+strip_file = EpisodeFile("strips", ".svg")  # a drawing of how it was executed
+memory_file = EpisodeFile("memories", ".npz")  # what the policy remembered
+frames_file = EpisodeFile("frames", ".npz")  # small frames until the response
+
+EPISODE_FILES = (video_file, thumbnail_file, stills_file, rrd_file, strip_file, memory_file, frames_file)
 
 
 def capture_stem(record: EpisodeRecord) -> str:
@@ -12,38 +35,3 @@ def capture_stem(record: EpisodeRecord) -> str:
     return (
         f"{task}_{record.policy}_K{record.n_action_steps}_run{record.run}_seed{record.seed}_{record.outcome}"
     )
-
-
-def video_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the video of an episode is, or would be."""
-    return folder / VIDEOS / f"{capture_stem(record)}.mp4"
-
-
-def thumbnail_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the image of an episode's cue and its choice is, or would be."""
-    return folder / VIDEOS / f"{capture_stem(record)}.jpg"
-
-
-def stills_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the stills of an episode (cue, reveal, touch) are, or would be."""
-    return folder / VIDEOS / f"{capture_stem(record)}_stills.jpg"
-
-
-def rrd_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the rerun file of an episode is, or would be."""
-    return folder / RRDS / f"{capture_stem(record)}.rrd"
-
-
-def strip_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the drawing of how an episode was executed is, or would be."""
-    return folder / STRIPS / f"{capture_stem(record)}.svg"
-
-
-def memory_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the file of what a policy remembered in an episode is, or would be."""
-    return folder / MEMORIES / f"{capture_stem(record)}.npz"
-
-
-def frames_file(folder: Path, record: EpisodeRecord) -> Path:
-    """Return where the file of an episode's small frames is, or would be."""
-    return folder / FRAMES / f"{capture_stem(record)}.npz"

@@ -6,14 +6,14 @@ from itertools import islice
 from pathlib import Path
 
 from vla_eval.errors import RunFolderError, VlaEvalError, did_you_mean, some_of
+from vla_eval.storage.capture_files import EPISODE_FILES
 from vla_eval.storage.run_file import RUN_FILE
 
 EPISODES_FILE = "episodes.jsonl"
 TIMINGS_FILE = "timings.jsonl"
 LOCK_FILE = "run.lock"
-LOGS, VIDEOS, RRDS, STRIPS = "logs", "videos", "rrd", "strips"
-MEMORIES, FRAMES = "memories", "frames"
-SUBFOLDERS = (LOGS, VIDEOS, RRDS, STRIPS, MEMORIES, FRAMES)
+LOGS = "logs"
+SUBFOLDERS = (LOGS, *dict.fromkeys(one.folder for one in EPISODE_FILES))
 # What a process that was killed before it wrote run.json may have left behind.
 UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from vla_eval.errors import MergeError
 from vla_eval.records import EpisodeKey, EpisodeRecord
-from vla_eval.storage.capture_files import rrd_file, strip_file, thumbnail_file, video_file
+from vla_eval.storage.capture_files import EPISODE_FILES
 from vla_eval.storage.drafts import link_file, whole_folder
 from vla_eval.storage.durable import replace_file
 from vla_eval.storage.episodes_file import shown_key
@@ -16,8 +16,6 @@ from vla_eval.storage.run_file import RunFile
 from vla_eval.storage.run_folder import StoredRun, read_run
 from vla_eval.storage.shard_parts import ShardPart, as_part, merge_descriptions, missing_shards
 from vla_eval.storage.timings import read_timings
-
-CAPTURES = (video_file, thumbnail_file, rrd_file, strip_file)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +59,7 @@ def write_merged(merged: MergedRun, out: Path) -> None:
         replace_file(draft / EPISODES_FILE, "".join(f"{one.to_json()}\n" for one in merged.records))
         merged.run_file.save(draft)
         for run in merged.runs:
-            for place, record in itertools.product(CAPTURES, run.records):
+            for place, record in itertools.product(EPISODE_FILES, run.records):
                 if place(run.path, record).is_file():
                     link_file(place(run.path, record), place(draft, record))
 
