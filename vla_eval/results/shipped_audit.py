@@ -64,7 +64,7 @@ UNREAD = "not read by linear probes"
 STORED: Mapping[str, str] = {
     ONE: "one stored frame is enough to remember the cue of",
     SEVERAL: "it takes several stored frames to remember the cue of",
-    INTEGRATED: "no stored frames are enough, what is seen must be integrated over time in",
+    INTEGRATED: "no stored frame is enough, what moves has to be tracked over time in",
 }
 """A verdict about what has to be stored -> its words in a note, before the tasks."""
 Asked = Literal["item", "place", "set", "order"]
