@@ -11,8 +11,14 @@ from vla_eval.errors import SpecMismatchError, VlaEvalError, did_you_mean, some_
 from vla_eval.features import PROPRIO_STATES, STATE_NAMES
 from vla_eval.specs import EnvSpec, PolicySpec
 from vla_eval.strict.json_text import shown
-from vla_eval.wire.metadata import COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY, CameraImage
-from vla_eval.wire.numbers import FLOAT_TYPES, NumbersError, as_state
+from vla_eval.wire.metadata import CameraImage
+from vla_eval.wire.numbers import (
+    COMMITTED_ACTIONS_KEY,
+    COMMITTED_FROZEN_KEY,
+    FLOAT_TYPES,
+    NumbersError,
+    as_state,
+)
 
 CAMERA_WIRE_KEYS = {"base_camera": "observation/image", "hand_camera": "observation/wrist_image"}
 """Camera -> key of its image. Source: openpi's policy for LIBERO,

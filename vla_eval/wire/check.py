@@ -13,13 +13,24 @@ from urllib.parse import urlsplit
 import numpy as np
 
 # Relative: the file is in two packages.
-from .check_client import CheckFailedError, Chunks, Episode, Facts, RefusedError, Server, run_episodes, shown
+from .check_client import (
+    CheckFailedError,
+    Chunks,
+    Episode,
+    Facts,
+    RefusedError,
+    Server,
+    committed,
+    run_episodes,
+    shown,
+)
 from .noise import PAIRS, SEEDS
-from .numbers import MEMORY
+from .numbers import COMMITTED_ACTIONS_KEY, MEMORY
 
 __all__ = ["CheckFailedError", "check_remote"]
 
 PROTOCOL = "openpi+1"
+CHUNKING_MODES = ("rtc", "prefix")
 IMAGE_SIZE_PX = 128  # of a camera whose size the server does not say
 NO_CODEC_BYTE = b"\xc1"  # the one byte that msgpack never begins with
 BY_SESSION = (
@@ -51,7 +62,8 @@ def check_remote(
     met: list[str] = []
     said = server.first_message()
     is_ours = said.get("protocol") == PROTOCOL
-    checks = [_healthz, _metadata, _chunks, _layouts, _seeds, _sessions, _resets, _memories, _refusals]
+    checks = [_healthz, _metadata, _chunks, _layouts, _seeds, _sessions, _resets, _memories, _joining]
+    checks.append(_refusals)
     for check in checks if is_ours else [_plain]:
         for claim in check(server):
             met.append(claim)
@@ -132,6 +144,9 @@ def _metadata(server: Server) -> list[str]:
     if said["state_layouts"]:
         has_key = isinstance(said.get("state_key"), str)
         server.expect(has_key, "`state_key` is a text.", shown(said.get("state_key")))
+    mode = said.get("chunking_mode")
+    is_known = mode is None or (isinstance(mode, str) and mode in CHUNKING_MODES)
+    server.expect(is_known, "`chunking_mode` is rtc or prefix, or left out.", shown(mode))
     for feature in ("reset", "seed", *(["observe"] if said["needs_every_frame"] else [])):
         server.expect(feature in said["supports"], f"`supports` has '{feature}'.", shown(said["supports"]))
     server.facts = Facts(
@@ -147,6 +162,7 @@ def _metadata(server: Server) -> list[str]:
         needs_every_frame=said["needs_every_frame"],
         batch_max=said["batch_max"],
         supports=said["supports"],
+        joins=mode is not None,
     )
     return [f"The first message says what the policy reads and returns ({said['name']})."]
 
@@ -233,6 +249,23 @@ def _memories(server: Server) -> list[str]:
     return [moved]
 
 
+def _joining(server: Server) -> list[str]:
+    """Ask for a chunk that joins the one before, of which nothing, a part or all is yet to be executed."""
+    if not server.facts.joins:
+        return []
+    joined = "A request may say what is committed; the answer is a chunk like any other."
+    size = server.facts.chunk_size
+    for n_left, n_frozen in ((0, 0), (max(size // 2, 1), 1), (size, 1)):
+        with server.connect() as connection:
+            episode = Episode(server, connection, 1)
+            episode.begin()
+            episode.ask()
+            episode.answer()
+            episode.ask(committed=committed(episode.chunks[-1][size - n_left :], n_frozen))
+            episode.answer()
+    return [joined]
+
+
 def _bad_messages(facts: Facts) -> dict[str, Any]:
     """Return description -> a message that has to be refused."""
     good = facts.observation(1, 0)
@@ -246,6 +279,12 @@ def _bad_messages(facts: Facts) -> dict[str, Any]:
     if MEMORY in facts.supports:
         begun = {**good, "endpoint": "memory/set"}
         bad["a memory for a session without an episode"] = {**begun, MEMORY: {}}
+    if facts.joins:
+        rows = np.zeros((facts.chunk_size + 1, facts.n_dims), dtype=np.float32)
+        bad["more committed actions than a chunk has"] = {**good, **committed(rows, 0)}
+        bad["more frozen actions than committed ones"] = {**good, **committed(rows[:1], 2)}
+        bad["committed actions that are not numbers"] = {**good, **committed(rows[:1] * np.float32("nan"), 1)}
+        bad["committed actions without how many are frozen"] = {**good, COMMITTED_ACTIONS_KEY: rows[:1]}
     if image is not None:
         bad["a missing image"] = {key: value for key, value in good.items() if key != image}
         bad["an image of another shape"] = {**good, image: good[image][:-1]}

@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 from .codec import MAX_MESSAGE_BYTES, CodecError, packb, unpackb  # relative: the file is in two packages
 from .keys import key_headers, key_problem
 from .noise import ROWS, look_at, n_inferences, noise_image, noise_state
-from .numbers import GET_MEMORY, MEMORY, SET_MEMORY
+from .numbers import COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY, GET_MEMORY, MEMORY, SET_MEMORY
 
 HORIZON_STEPS = 60
 PROMPTS, TASK = ("pick up the red cube", "touch the cube that was shown"), "RememberColor3-v0"
@@ -47,6 +47,7 @@ class Facts:
     needs_every_frame: bool
     batch_max: int
     supports: Sequence[str]
+    joins: bool  # whether its chunks join what a request says is committed
 
     def observation(self, seed: int, step: int, layout: str | None = None) -> Message:
         """Return noise in the announced shapes, see `noise.py`."""
@@ -193,8 +194,11 @@ class Episode:
             reply.get("status") == "reset", "The reply to `reset` has 'status': 'reset'.", shown(reply)
         )
 
-    def ask(self, layout: str | None = None) -> None:
-        """Send the frames since the last inference, then the newest one with the request."""
+    def ask(self, layout: str | None = None, *, committed: Message | None = None) -> None:
+        """Send the frames since the last inference, then the newest one with the request.
+
+        `committed`: what the request says is committed.
+        """
         step = self._next * self._facts.chunk_size
         named = {"session_id": self._session_id}
         if self._facts.needs_every_frame:
@@ -202,7 +206,8 @@ class Episode:
                 frame = self._facts.observation(self._seed, past, layout)
                 self._connection.send({**frame, **named, "step": past, "endpoint": "observe"})
         frame = self._facts.observation(self._seed, step, layout)
-        self._connection.send({**frame, **named, "step": step, "endpoint": "infer"})
+        request = {**frame, **(committed or {}), **named, "step": step, "endpoint": "infer"}
+        self._connection.send(request)
 
     def answer(self) -> None:
         """Read the reply, check it, and keep its actions."""
@@ -244,6 +249,11 @@ class Episode:
             return self._connection.receive(self._session_id)
         except RefusedError as exc:
             raise self._server.failed(f"a request that keeps the protocol was refused: {exc}") from exc
+
+
+def committed(actions: np.ndarray[Any, Any], n_frozen: int) -> Message:
+    """Return what a request says is committed: actions (N, A), and how many of them are frozen."""
+    return {COMMITTED_ACTIONS_KEY: np.ascontiguousarray(actions), COMMITTED_FROZEN_KEY: n_frozen}
 
 
 def run_episodes(episodes: Sequence[Episode]) -> list[Chunks]:

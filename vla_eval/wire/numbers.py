@@ -20,6 +20,8 @@ MEMORY = "memory"
 """Of `supports`: the policy's memory can be read and replaced. Also the key of a memory in a message."""
 GET_MEMORY, SET_MEMORY = "memory/get", "memory/set"
 """Endpoints of a server that supports `MEMORY`."""
+COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY = "committed/actions", "committed/n_frozen"
+"""Of a request: the actions left of the chunk under way, and how many will be executed in any case."""
 MAX_MEMORY_BYTES = 32 * 2**20  # of all arrays of a memory in a message
 MAX_MEMORY_ARRAYS = 1024
 

@@ -13,7 +13,14 @@ from typing import Any, Mapping
 
 import numpy as np
 
-from mikasa_vla_client.numbers import MEMORY, NumbersError, as_state, memory_problem
+from mikasa_vla_client.numbers import (
+    COMMITTED_ACTIONS_KEY,
+    COMMITTED_FROZEN_KEY,
+    MEMORY,
+    NumbersError,
+    as_state,
+    memory_problem,
+)
 
 __version__ = "0.1.0"
 PROTOCOL = "openpi+1"
@@ -22,6 +29,8 @@ CAMERA_KEYS = {"base_camera": "observation/image", "hand_camera": "observation/w
 """Camera of the simulator -> key in an observation, as in openpi's policy for LIBERO."""
 
 STATE_KEY, PROMPT_KEY = "observation/state", "prompt"
+CHUNKING_MODES = ("rtc", "prefix")
+"""How chunks may join what is committed; `docs/real_time.md` of mikasa-vla-eval says what each does."""
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _JOINTS = ("joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "joint7", "finger1", "finger2")
 STATE_LAYOUTS = {
@@ -60,6 +69,10 @@ class PolicySpec:
             policy without weights.
         has_memory: whether its memory of an episode can be read and replaced; then it has the methods
             `get_memory(session)`, which returns a dict of arrays, and `set_memory(session, memory)`.
+        chunking_mode: `rtc` or `prefix` if a new chunk joins the one under way, else None. Observations then
+            have `committed/actions` (N, number of action_dims) float32, the actions that are left of that
+            chunk from this step on, and `committed/n_frozen`, how many of them will be executed before the
+            new chunk can arrive; neither of the two where nothing is committed.
     """
 
     name: str
@@ -74,6 +87,7 @@ class PolicySpec:
     needs_every_frame: bool = False
     weights_file: str | None = None
     has_memory: bool = False
+    chunking_mode: str | None = None
 
     def __post_init__(self) -> None:
         """Check every value.
@@ -106,6 +120,8 @@ class PolicySpec:
         self._expect(is_rate, "control_hz", "a number above 0")
         for field in ("needs_every_frame", "has_memory"):
             self._expect(isinstance(getattr(self, field), bool), field, "True or False")
+        is_known = self.chunking_mode is None or self.chunking_mode in CHUNKING_MODES
+        self._expect(is_known, "chunking_mode", " or ".join(map(repr, CHUNKING_MODES)) + " or None")
         is_there = self.weights_file is None or Path(self.weights_file).is_file()
         self._expect(is_there, "weights_file", "a file that exists, or None")
 
@@ -138,6 +154,7 @@ class PolicySpec:
             "needs_every_frame": self.needs_every_frame,
             "needs_session_id": False,
             "batch_max": 1,
+            **({} if self.chunking_mode is None else {"chunking_mode": self.chunking_mode}),
             "supports": ["reset", "observe", "seed", *([MEMORY] if self.has_memory else [])],
             "versions": {
                 "mikasa_vla_client": __version__,
@@ -164,6 +181,34 @@ class PolicySpec:
                 as_state(_required(observation, STATE_KEY), STATE_LAYOUTS[self.state])
             except NumbersError as exc:
                 raise ValueError(f"'{STATE_KEY}': {exc}.") from exc
+        self._check_committed(observation)
+
+    def _check_committed(self, observation: Mapping[str, Any]) -> None:
+        says = [key for key in (COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY) if key in observation]
+        if not says:
+            return
+        if self.chunking_mode is None:
+            raise ValueError(
+                f"'{says[0]}': the chunks of policy '{self.name}' do not join what is committed "
+                "(`chunking_mode` is None)."
+            )
+        actions = _required(observation, COMMITTED_ACTIONS_KEY)
+        n_frozen = _required(observation, COMMITTED_FROZEN_KEY)
+        n_dims = len(self.action_dims)
+        is_array = isinstance(actions, np.ndarray) and actions.dtype == np.float32 and actions.ndim == 2
+        fits = is_array and actions.shape[1] == n_dims and len(actions) <= self.chunk_size
+        if not fits or not np.isfinite(actions).all():
+            found = f"{actions.dtype} of shape {actions.shape}" if is_array else type(actions).__name__
+            raise ValueError(
+                f"'{COMMITTED_ACTIONS_KEY}': expected float32 of shape (N, {n_dims}), all finite, with N at "
+                f"most {self.chunk_size}, found {found}."
+            )
+        is_number = isinstance(n_frozen, int) and not isinstance(n_frozen, bool)
+        if not is_number or not 0 <= n_frozen <= len(actions):
+            raise ValueError(
+                f"'{COMMITTED_FROZEN_KEY}': expected a number from 0 to {len(actions)}, the rows of "
+                f"'{COMMITTED_ACTIONS_KEY}', found {n_frozen!r:.80}."
+            )
 
     def check_memory(self, memory: Any) -> dict[str, Any]:
         """Return a memory that the policy has handed out, or that it is to get.

@@ -20,12 +20,8 @@ from vla_eval.policies.remote.settings import RemoteSettings, remote_settings
 from vla_eval.specs import ActionSpec, PolicySpec
 from vla_eval.wire.addresses import split_urls
 from vla_eval.wire.client import PolicyClient
-from vla_eval.wire.metadata import (
-    COMMITTED_ACTIONS_KEY,
-    COMMITTED_FROZEN_KEY,
-    ServerMetadata,
-)
-from vla_eval.wire.numbers import MEMORY, memory_problem
+from vla_eval.wire.metadata import ServerMetadata
+from vla_eval.wire.numbers import COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY, MEMORY, memory_problem
 
 SESSION_BYTES = 8
 
