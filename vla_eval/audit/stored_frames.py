@@ -138,7 +138,7 @@ def fewest_frames(
     Args:
         shown: (T, N) which candidates' cues are in view at each step.
         record: the episode, whose right candidates are asked for.
-        left_out: the right ones are told by seeing all others.
+        left_out: the cue shows all but the right ones.
     """
     right = frozenset(record.right_candidates or ())
     if shown is None or not right:

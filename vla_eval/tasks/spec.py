@@ -116,7 +116,7 @@ class TaskSpec:
 
     @property
     def has_alike_candidates(self) -> bool:
-        """Whether the candidates are mugs: nothing but their places tells one from another."""
+        """Whether the candidates are mugs: nothing but their places distinguishes them."""
         return "mugs" in (self.candidates, self.true_state)
 
     @property
