@@ -2,6 +2,7 @@
 
 import csv
 import io
+import itertools
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -82,6 +83,25 @@ def inspect_robots() -> dict[str, Any]:
     return {"version": 1, "status": "success", "eval": {**spec, "max_steps": 80}, "samples": samples}
 
 
+def inspect_ai() -> dict[str, Any]:
+    """The fields of a log that inspect_ai 0.3.285 wrote: five samples, two epochs, one sample that raised."""
+    spec = {"task": "remember_color", "model": "mockllm/model", "config": {"epochs": 2}, "dataset": {}}
+    samples: list[dict[str, Any]] = []
+    for epoch, number in itertools.product((1, 2), range(1, 6)):
+        score = {"success": {"value": "C" if number % 2 else "I", "history": []}}
+        samples.append({"id": number, "epoch": epoch, "scores": score, "target": "x"})
+    samples[3] |= {"scores": {}, "error": {"message": "simulator died", "traceback": "…"}}
+    return {
+        "version": 2,
+        "status": "success",
+        "eval": spec,
+        "plan": {"name": "plan", "steps": [{"solver": "act"}]},
+        "results": {"total_samples": 10, "completed_samples": 9, "scores": [{"name": "success"}]},
+        "stats": {},
+        "samples": samples,
+    }
+
+
 def robostats() -> str:
     """As `EpisodeRecorder` of robostats 0.2.0 writes it."""
     common = {"schema_version": 2, "policy_id": "p", "task_id": "RememberColor3-v0", "scenario_id": "s"}
@@ -109,6 +129,7 @@ FILES: dict[str, Callable[[], dict[str, Any] | str]] = {
     "allenai's vla-evaluation-harness": allenai,
     "official MIKASA-Robo-VLA runner": official,
     "inspect-robots": inspect_robots,
+    "inspect_ai": inspect_ai,
     "robostats": robostats,
     "openvla-oft": openvla_oft,
 }
@@ -130,6 +151,7 @@ COUNTS: dict[str, list[tuple[str, str | None, int, int, int]]] = {
     "allenai's vla-evaluation-harness": [("RememberColor3-v0", None, 2, 3, 1)],
     "official MIKASA-Robo-VLA runner": [("RememberColor3-VLA-v0", "mine", 3, 4, 0)],
     "inspect-robots": [("reach", "random", 2, 3, 1)],
+    "inspect_ai": [("remember_color", "mockllm/model", 6, 9, 1)],
     "robostats": [("RememberColor3-v0", "p", 2, 3, 0)],
     "openvla-oft": [
         ("libero_10: put the bowl away", None, 1, 1, 1),
@@ -190,6 +212,12 @@ def change(content: dict[str, Any], path: str, value: object) -> dict[str, Any]:
         (change(inspect_robots(), "version", 2), "expected version 1"),
         (change(inspect_robots(), "samples.1.epochs.0", {"success_at_end": 0.5}), "expected 0 or 1"),
         (change(inspect_robots(), "samples.1.epochs.0", {"reached": 1.0}), "expected 0 or 1"),
+        (change(inspect_ai(), "version", 1), "expected version 2"),
+        (change(inspect_ai(), "results.completed_samples", 10), "9 have a score"),
+        (change(inspect_ai(), "samples.0.scores.success.value", "P"), "expected C or I"),
+        (change(inspect_ai(), "samples.0.scores.success.value", 0.5), "expected C or I"),
+        (change(inspect_ai(), "samples.0.scores.success.value", None), "expected C or I"),
+        (change(inspect_ai(), "samples.0.scores", {"a": {"value": "C"}, "b": {"value": "I"}}), "score None"),
         (robostats().replace("false", "0"), "line 2"),
         (robostats().replace('"task_id"', '"task"'), "task_id"),
         (openvla_oft().replace("# successes: 1 (33.3%)", "# successes: 2 (66.7%)"), "the episodes above it"),
@@ -206,6 +234,18 @@ def test_what_contradicts_itself_or_is_something_else_is_refused(
     with pytest.raises(ReportError, match="results") as error:
         read(tmp_path, content)
     assert said in str(error.value)
+
+
+def test_of_several_scorers_the_one_that_is_called_success_counts(tmp_path: Path) -> None:
+    log = inspect_ai()
+    for sample in log["samples"]:
+        sample["scores"] |= {"length": {"value": 60}} if sample["scores"] else {}
+    (row,) = read(tmp_path, log)
+    assert (row.n_success, row.n_episodes) == (6, 9)
+    for sample in log["samples"]:
+        sample["scores"] = {f"my_{name}": score for name, score in sample["scores"].items()}
+    with pytest.raises(ReportError, match=r"scores of my_length, my_success.*'success'"):
+        read(tmp_path, log)
 
 
 def test_a_file_that_is_not_there_or_no_text_is_refused(tmp_path: Path) -> None:

@@ -138,6 +138,46 @@ def _inspect_robots(data: Any, source: Source) -> Rows:
     )
 
 
+SUCCESS = "success"  # name of the scorer that counts, where there are several
+
+
+def _inspect_ai(data: Any, source: Source) -> Rows:
+    found = read_part(schemas.InspectAiLog, data, source)
+    if found.version != 2:
+        raise source.refuse(f"version {found.version}", "expected version 2")
+    results = [one.scores for one in found.samples if one.error is None and one.scores]
+    names = sorted({name for scores in results for name in scores})
+    if len(names) > 1 and SUCCESS not in names:
+        raise source.refuse(
+            f"scores of {', '.join(names)}", f"expected one scorer, or one that is called '{SUCCESS}'"
+        )
+    own = names[0] if len(names) == 1 else SUCCESS
+    check_some(len(results), source, of=found.eval.task)
+    if found.results.completed_samples != len(results):
+        raise source.refuse(
+            f"completed_samples {found.results.completed_samples}", f"{len(results)} have a score"
+        )
+    won = [_is_correct(scores.get(own, {}).get("value"), source) for scores in results]
+    yield ImportedRow(
+        program="inspect_ai",
+        file=source.where,
+        task=found.eval.task,
+        policy=found.eval.model,
+        n_success=sum(won),
+        n_episodes=len(won),
+        n_errors=len(found.samples) - len(won),
+        notes=() if found.status == SUCCESS else (f"the run ended with the status {found.status}",),
+    )
+
+
+def _is_correct(value: object, source: Source) -> bool:
+    if value in ("C", 1):  # also 1.0 and true
+        return True
+    if value in ("I", 0):
+        return False
+    raise source.refuse(f"the score {value!r:.80}", "expected C or I, true or false, 1 or 0")
+
+
 def _robostats(text: str, source: Source) -> Rows:
     records: dict[tuple[str, str], list[schemas.RobostatsRecord]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
@@ -240,6 +280,12 @@ PROGRAMS: tuple[Program, ...] = (
         file="ENV_ID.json",
         keys=frozenset({"env_id", "successes", "episode_seeds"}),
         read_json=_official,
+    ),
+    Program(
+        name="inspect_ai",
+        file="log, as `inspect eval --log-format json` writes it",
+        keys=frozenset({"version", "eval", "plan", "samples"}),
+        read_json=_inspect_ai,
     ),
     Program(
         name="inspect-robots",

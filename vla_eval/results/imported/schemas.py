@@ -113,6 +113,40 @@ class InspectLog:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class InspectAiSpec:
+    """`eval` of a log of inspect_ai 0.3.285, log/_log.py."""
+
+    task: str
+    model: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectAiResults:
+    """Its own count."""
+
+    completed_samples: Count
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectAiSample:
+    """One sample of one epoch; one that raised has no score, unless the task asked for one."""
+
+    scores: dict[str, dict[str, Any]] | None = None  # name of a scorer -> its score, with `value`
+    error: dict[str, Any] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InspectAiLog:
+    """The whole log, written with `--log-format json`."""
+
+    version: int
+    status: str
+    eval: InspectAiSpec
+    results: InspectAiResults
+    samples: tuple[InspectAiSample, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RobostatsProtocol:
     """What a line says of how it was collected."""
 
