@@ -1,11 +1,14 @@
 """The adapter of the official tasks, on a small environment in place of an official one."""
 
 import sys
+from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 
 from tests.envs.hiding_env import HidingEnv
 from vla_eval.config.environment import EnvSettings
@@ -13,8 +16,12 @@ from vla_eval.core import EpisodeStart, StepResult
 from vla_eval.envs import official
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.official import official_class
+from vla_eval.envs.official_assets import SHAPES, provide_bulb
+from vla_eval.envs.official_settings import WITH_LAMPS
+from vla_eval.envs.scenes import build
 from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNameError
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalogs.official_catalog import MIKASA_VLA_90
 
 TASK = "mikasa_vla/RememberColor3-VLA-v0"
 CUE_STEPS, DELAY_STEPS = 2, 1
@@ -138,6 +145,49 @@ def test_without_the_package_the_message_says_how_to_install_it(monkeypatch: pyt
     monkeypatch.setitem(sys.modules, "mikasa_robo_suite", None)
     with pytest.raises(MissingDependencyError, match="Run `make suite90`"):
         official_class(task_spec(TASK))
+
+
+def test_a_lamp_without_its_file_is_an_error_or_has_a_sphere_as_the_run_says(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    made: list[Any] = []
+    shapes = ModuleType(SHAPES)
+    shapes.__file__ = str(tmp_path / "shapes.py")
+    lamp = lambda _name, bulb_asset_path=None: made.append(bulb_asset_path)  # noqa: E731
+    monkeypatch.setattr(shapes, "build_color_switch_lamp", lamp, raising=False)
+    monkeypatch.setitem(sys.modules, SHAPES, shapes)
+    monkeypatch.setattr("vla_eval.envs.official_assets.cached", lambda name: tmp_path / name)
+    file = tmp_path / "objects" / "low_poly_light_bulb.glb"
+    with pytest.raises(MissingDependencyError, match=f"{file}.*--set env.bulb=stand_in"):
+        provide_bulb("package", task=TASK)
+
+    assert provide_bulb("stand_in", task=TASK) == "stand-in of this package: a sphere"
+    shapes.build_color_switch_lamp("lamp")
+    sphere = trimesh.load(made[-1], force="mesh")
+    # 12 mm around the point that the lamp maker lowers by 7 cm, once it has scaled the file by 0.85.
+    np.testing.assert_allclose(0.85 * sphere.bounds.mean(axis=0), (0, 0.07, 0), atol=1e-6)
+    np.testing.assert_allclose(0.85 * sphere.extents / 2, 0.012, atol=2e-4)
+
+    file.parent.mkdir()
+    file.touch()
+    assert provide_bulb("package", task=TASK) == "the package's"
+    shapes.build_color_switch_lamp("lamp")
+    assert made[-1] is None
+
+
+def test_lamps_are_known_by_the_names_of_their_tasks() -> None:
+    with_lamps = [task for task in MIKASA_VLA_90 if task.rpartition("/")[2].startswith(WITH_LAMPS)]
+    assert len(with_lamps) == 30
+
+
+def test_a_file_of_a_scene_that_is_not_there_is_no_renderer_that_did_not_start() -> None:
+    def scene(**_: Any) -> Any:
+        raise RuntimeError(
+            "filesystem error: cannot make canonical path: No such file or directory [/a/lamp.glb]"
+        )
+
+    with pytest.raises(MissingDependencyError, match=r"expected the file /a/lamp\.glb, of which its scene is"):
+        build(scene, EnvSettings(task=TASK))
 
 
 def test_the_angle_of_an_episode_is_put_into_its_instruction() -> None:

@@ -21,8 +21,8 @@ import torch
 
 from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.core import FloatArray, Observation, StepResult
-from vla_eval.envs.official_mug import provide_mug
-from vla_eval.envs.official_settings import MUG, check_official
+from vla_eval.envs.official_assets import provide_bulb, provide_mug
+from vla_eval.envs.official_settings import BULB, MUG, WITH_LAMPS, check_official
 from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates, to_vector
 from vla_eval.envs.scenes import build, describe, take_human_image, take_images
 from vla_eval.envs.true_states import TrueStates
@@ -56,6 +56,8 @@ class OfficialEnv:
         self.device: dict[str, str] = {}
         if "/ShellGame" in row.id:
             self.device[MUG] = provide_mug(settings.kwargs.get(MUG, "ycb"), task=row.id)
+        if settings.cameras and row.id.rpartition("/")[2].startswith(WITH_LAMPS):
+            self.device[BULB] = provide_bulb(settings.kwargs.get(BULB, "package"), task=row.id)
         # A scene of its own per episode: what the simulator keeps of an earlier one moves the next.
         arm = {"control_mode": ACTION.control_mode, "robot_uids": ROBOT, "reconfiguration_freq": 1}
         self._envs = [

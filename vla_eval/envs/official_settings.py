@@ -11,11 +11,19 @@ from vla_eval.tasks.spec import TaskSpec
 MUG = "mug"
 """Name of the argument of the shell games: whose mug. Other tasks take it, too, for one run of all."""
 Mug = Literal["ycb", "stand_in"]
+BULB = "bulb"
+"""Name of the argument of tasks with a lamp: whose light bulb. Other tasks take it, too."""
+Bulb = Literal["package", "stand_in"]
+WITH_LAMPS = (
+    *("ShellGameColorLamp", "ShellGameShuffleColorLamp", "BatteriesChecker", "BlinkCount", "TraceShape"),
+    *("TimedTransfer", "GatherAndRecall"),
+)
+"""How the names of the tasks with a lamp begin."""
 
 
 def check_official(settings: EnvSettings, row: TaskSpec) -> None:
     """Refuse settings that the official environments do not have."""
-    check_names("argument", settings.kwargs, (HORIZON, MUG), where=row.id)
+    check_names("argument", settings.kwargs, (HORIZON, MUG, BULB), where=row.id)
     asked = {
         "sim_backend=gpu": settings.sim_backend == "gpu",
         "appearance": settings.appearance != AS_DESIGNED,
@@ -29,5 +37,6 @@ def check_official(settings: EnvSettings, row: TaskSpec) -> None:
             )
     if HORIZON in settings.kwargs:
         check_argument(SomeSteps, settings.kwargs[HORIZON], name=HORIZON, task=row.id)
-    if MUG in settings.kwargs:
-        check_argument(Mug, settings.kwargs[MUG], name=MUG, task=row.id)
+    for name, kind in ((MUG, Mug), (BULB, Bulb)):
+        if name in settings.kwargs:
+            check_argument(kind, settings.kwargs[name], name=name, task=row.id)

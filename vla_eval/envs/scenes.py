@@ -1,5 +1,6 @@
 """What adapters of ManiSkill environments share: images, the renderer's name. Knows no tasks."""
 
+import re
 from typing import Any  # ManiSkill is untyped: its environments and tensors are Any here
 
 import sapien
@@ -9,7 +10,7 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ImageArray
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.envs.wrist_view import WRIST_CAMERA, WristView
-from vla_eval.errors import RenderingError
+from vla_eval.errors import MissingDependencyError, RenderingError
 from vla_eval.strict.devices import refuse_missing_gpu
 
 RENDERING_ADVICE = (
@@ -19,6 +20,7 @@ RENDERING_ADVICE = (
 
 
 CPU_RENDERER = "sapien_cpu"
+_MISSING_FILE = re.compile(r"filesystem error: .*No such file or directory \[(.+)\]")  # as SAPIEN says it
 
 
 def render_backend(settings: EnvSettings) -> str:
@@ -56,6 +58,12 @@ def build(cls: Any, settings: EnvSettings, **arguments: Any) -> Any:
     try:
         return cls(obs_mode="none", reward_mode="normalized_dense", render_backend=backend, **arguments)
     except RuntimeError as exc:
+        missing = _MISSING_FILE.search(str(exc))
+        if missing is not None:
+            raise MissingDependencyError(
+                f"{settings.task}: expected the file {missing[1]}, of which its scene is made, found none. "
+                "Put it there, or install the package whole that it belongs to."
+            ) from exc
         if backend == "none" or settings.sim_backend == "gpu":
             raise
         raise RenderingError(

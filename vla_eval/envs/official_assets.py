@@ -1,10 +1,13 @@
-"""The mug of the official shell games: YCB's `025_mug`, or a stand-in of the same size in the same files.
+"""What official tasks read of assets that are not in the package's wheel, and stand-ins for them.
 
-ManiSkill looks for the asset in its own folder. The stand-in is written into this package's cache, and the
-modules that read the asset are given that folder; ManiSkill's folder is not touched, so that no other task
-takes it for the YCB object set.
+The mug of the shell games is YCB's `025_mug`. ManiSkill looks for it in its own folder. The stand-in is
+written into this package's cache, and the modules that read the asset are given that folder; ManiSkill's
+folder is not touched, so that no other task takes it for the YCB object set. The light bulb of the lamps is
+a file beside the package's code that its wheel 1.0.0 lacks.
 """
 
+import functools
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -16,7 +19,7 @@ import trimesh as trimesh_library
 from mani_skill import ASSET_DIR
 from mani_skill.utils.building.actors import ycb
 
-from vla_eval.envs.official_settings import Mug
+from vla_eval.envs.official_settings import BULB, Bulb, Mug
 from vla_eval.errors import MissingDependencyError
 from vla_eval.storage.cache import cached
 from vla_eval.storage.drafts import appearing
@@ -36,6 +39,11 @@ ASSET = "025_mug"
 FOLDER = "assets/mani_skill2_ycb"
 READERS = "mikasa_robo_suite."
 
+SHAPES, LAMP_MAKER = "mikasa_robo_suite.vla.utils.shapes", "build_color_switch_lamp"
+BULB_FILE = Path("objects") / "low_poly_light_bulb.glb"  # beside the module
+# Of the lamp maker: how its file is scaled and lowered, and the radius of the bulb's collision shape.
+BULB_SCALE, BULB_LOWERED_M, BULB_RADIUS_M = 0.85, 0.07, 0.012
+
 
 def provide_mug(mug: Mug, *, task: str) -> str:
     """Make the files of a mug, `ycb` or `stand_in`, findable; return what it is, for the run."""
@@ -50,6 +58,36 @@ def provide_mug(mug: Mug, *, task: str) -> str:
             "package: --set env.mug=stand_in."
         )
     return f"YCB {ASSET}"
+
+
+def provide_bulb(bulb: Bulb, *, task: str) -> str:
+    """Let lamps be made with the file `package`, or with a `stand_in`; return which it is, for the run."""
+    shapes: Any = importlib.import_module(SHAPES)
+    make: Any = getattr(shapes, LAMP_MAKER)
+    make = getattr(make, "func", make)  # as the package has it
+    if bulb == "stand_in":
+        setattr(shapes, LAMP_MAKER, functools.partial(make, bulb_asset_path=str(_stand_in_bulb())))
+        return "stand-in of this package: a sphere"
+    setattr(shapes, LAMP_MAKER, make)
+    file = Path(shapes.__file__).parent / BULB_FILE
+    if not file.is_file():
+        raise MissingDependencyError(
+            f"{task} draws a lamp, and expects its light bulb in {file}, which the wheel of the package "
+            f"lacks. Put the file there, or use a sphere of this package: --set env.{BULB}=stand_in."
+        )
+    return "the package's"
+
+
+def _stand_in_bulb() -> Path:
+    """Return a sphere where the lamp maker expects the bulb in its file, y up; write it if need be."""
+    root = cached("official_bulb")
+    file = root / BULB_FILE.name
+    if not file.is_file():
+        sphere = trimesh.creation.icosphere(subdivisions=3, radius=BULB_RADIUS_M / BULB_SCALE)
+        sphere.apply_translation((0, BULB_LOWERED_M / BULB_SCALE, 0))
+        with appearing(root) as draft:
+            sphere.export(draft / file.name)
+    return file
 
 
 def _read_from(root: Path) -> None:
