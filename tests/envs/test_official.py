@@ -186,7 +186,7 @@ def test_a_file_of_a_scene_that_is_not_there_is_no_renderer_that_did_not_start()
             "filesystem error: cannot make canonical path: No such file or directory [/a/lamp.glb]"
         )
 
-    with pytest.raises(MissingDependencyError, match=r"expected the file /a/lamp\.glb, of which its scene is"):
+    with pytest.raises(MissingDependencyError, match=r"expected the file /a/lamp\.glb, of which its scene"):
         build(scene, EnvSettings(task=TASK))
 
 
