@@ -14,7 +14,7 @@ from vla_eval.audit.stored_frames import _row, fewest_frames, verdict
 from vla_eval.cli.main import main
 from vla_eval.evaluation.memory_log import EpisodeMemory
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.shipped_audit import ONE, SEVERAL, UNREAD
+from vla_eval.results.shipped_audit import NEWEST, ONE, SEVERAL, UNREAD
 from vla_eval.tasks.catalog import OFFICIAL_TASKS
 from vla_eval.tasks.spec import TaskSpec
 
@@ -207,6 +207,18 @@ def test_items_shown_one_by_one_take_several_frames() -> None:
     assert (row.first, row.all, row.probes) == (60, 60, ONE)
     assert (row.n_frames, row.verdict) == (3, SEVERAL)
     assert row.cue_end < 60  # the last frame of the cue shows the last item, which is always the same
+
+
+def test_where_the_newest_frame_tells_the_answer_nothing_has_to_be_stored() -> None:
+    def lit(seed: int, item: int) -> tuple[EpisodeRecord, EpisodeMemory]:
+        record, memory = episode(seed, (item, 2, 4))
+        frames = memory.frames["base_camera"].copy()
+        frames[-1] = 60 * (item + 1)  # as a lamp of the colour that was always shown at the same place
+        return record, replace(memory, frames={"base_camera": frames})
+
+    row = _row("ChainOfColors3-v0", "set", [lit(seed, seed % 2) for seed in range(40)])
+    assert (row.newest, row.probes, row.verdict) == (40, NEWEST, NEWEST)
+    assert row.n_frames == 3  # all the same
 
 
 def test_one_frame_is_enough_for_an_item(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

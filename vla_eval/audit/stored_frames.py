@@ -24,7 +24,7 @@ from vla_eval.evaluation.memory_log import EpisodeMemory
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import PairCounts, Share, mcnemar_exact, p_above
 from vla_eval.results.printed_table import Column, PrintedTable, cells_of, write_tables
-from vla_eval.results.shipped_audit import INTEGRATED, ONE, SEVERAL, UNREAD, Asked, StoredFrames
+from vla_eval.results.shipped_audit import INTEGRATED, NEWEST, ONE, SEVERAL, UNREAD, Asked, StoredFrames
 from vla_eval.storage.capture_files import frames_file
 from vla_eval.storage.run_folder import read_run
 from vla_eval.tasks.catalog import task_spec
@@ -103,7 +103,8 @@ def _row(task: str, asked: Asked, episodes: Sequence[tuple[EpisodeRecord, Episod
     best, best_step = probes.best_of([(newest, step) for step in (*_spread(earlier), *probes.own)])
     everything = probes.everything([*_spread(cue), *probes.own, newest])
     chance = max(labels.count(one) for one in set(labels)) / len(labels)
-    found = verdict(best, everything, chance)
+    alone = probes.best_of([(newest,)])[0]
+    found = NEWEST if _is_read(alone, chance) else verdict(best, everything, chance)
     frames = [fewest_frames(one.shown, record, left_out=spec.cue_leaves_out) for record, one in episodes]
     n_frames = None if spec.is_tracked else _most(frames)
     return StoredFrames(
@@ -112,7 +113,7 @@ def _row(task: str, asked: Asked, episodes: Sequence[tuple[EpisodeRecord, Episod
         asked=asked,
         n_episodes=len(episodes),
         chance=chance,
-        newest=_n(probes.best_of([(newest,)])[0]),
+        newest=_n(alone),
         first=_n(probes.best_of([(newest, probes.first)])[0]),
         cue_end=_n(probes.best_of([(newest, probes.cue_end)])[0]),
         best=_n(best),
@@ -125,7 +126,7 @@ def _row(task: str, asked: Asked, episodes: Sequence[tuple[EpisodeRecord, Episod
 
 
 def _of_both(probes: str, n_frames: int | None) -> str:
-    if n_frames is None or probes == SEVERAL:
+    if n_frames is None or probes in (SEVERAL, NEWEST):
         return probes
     return ONE if n_frames == 1 else SEVERAL
 
@@ -159,8 +160,7 @@ def _most(numbers: Sequence[int | None]) -> int | None:
 
 def verdict(best: Right, everything: Right, chance: float) -> str:
     """Return what the two probes say: from the newest and the best stored frame, and from all frames."""
-    most = max(int(best.sum()), int(everything.sum()))
-    if most < READ * len(best) or p_above(most, len(best), chance) >= ALPHA:
+    if not _is_read(max(best, everything, key=_n), chance):
         return UNREAD
     pairs = PairCounts(
         both=int((best & everything).sum()),
@@ -173,6 +173,11 @@ def verdict(best: Right, everything: Right, chance: float) -> str:
     return SEVERAL if more else ONE
 
 
+def _is_read(right: Right, chance: float) -> bool:
+    """Whether a probe is right so often that what it gets tells the answer."""
+    return _n(right) >= READ * len(right) and p_above(_n(right), len(right), chance) < ALPHA
+
+
 def render_stored_frames(rows: Sequence[StoredFrames], style: Literal["markdown", "json"]) -> str:
     """Return the table."""
     if style == "json":
@@ -180,10 +185,11 @@ def render_stored_frames(rows: Sequence[StoredFrames], style: Literal["markdown"
     notes = [
         "Share of episodes in which linear probes are right in all that is asked; each episode is predicted "
         "by probes of other seeds. set: which items; order: in the order shown.",
-        f"Probes: {ONE}: all frames together are not better than the newest and one other (exact McNemar "
-        f"test, {ALPHA}); {UNREAD}: neither is right in {READ:.0%} of the episodes, and above chance.",
+        f"Probes: {NEWEST}: it alone is right in {READ:.0%} of the episodes, and above chance; {ONE}: all "
+        f"frames together are not better than the newest and one other (exact McNemar "
+        f"test, {ALPHA}); {UNREAD}: neither is right so often.",
         "Frames that show it: the fewest that have all that is right in view, by the simulator. The verdict "
-        "is about them; where the probes find that one is not enough, it is not.",
+        "is about them; where the probes find that one is not enough, or none is needed, theirs holds.",
     ]
     return write_tables([PrintedTable(columns=_COLUMNS, rows=cells_of(_COLUMNS, rows), notes=notes)], style)
 

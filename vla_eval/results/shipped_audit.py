@@ -59,9 +59,11 @@ OTHER_VERDICTS: Mapping[str, str] = {
 """A verdict without a shortcut -> its words in a note."""
 
 ONE, SEVERAL = "one stored frame is enough", "several stored frames"
+NEWEST = "the newest frame is enough"
 INTEGRATED = "must be integrated over time"
 UNREAD = "not read by linear probes"
 STORED: Mapping[str, str] = {
+    NEWEST: "the newest frame is enough, so that nothing has to be remembered, in",
     ONE: "one stored frame is enough to remember the cue of",
     SEVERAL: "it takes several stored frames to remember the cue of",
     INTEGRATED: "no stored frame is enough, what moves has to be tracked over time in",
