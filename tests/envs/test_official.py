@@ -20,7 +20,7 @@ from vla_eval.envs.official_assets import SHAPES, provide_bulb
 from vla_eval.envs.official_settings import WITH_LAMPS
 from vla_eval.envs.scenes import build
 from vla_eval.errors import MissingDependencyError, TaskArgumentError, UnknownNameError
-from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.catalog import OFFICIAL_TASKS, SUITES, task_spec
 from vla_eval.tasks.catalogs.official_catalog import MIKASA_VLA_90
 
 TASK = "mikasa_vla/RememberColor3-VLA-v0"
@@ -173,6 +173,11 @@ def test_a_lamp_without_its_file_is_an_error_or_has_a_sphere_as_the_run_says(
     assert provide_bulb("package", task=TASK) == "the package's"
     shapes.build_color_switch_lamp("lamp")
     assert made[-1] is None
+
+
+def test_the_original_tasks_are_the_paper_s_but_for_those_with_a_peg() -> None:
+    original = {task.removeprefix("mikasa_official/") for task in OFFICIAL_TASKS if "official/" in task}
+    assert original == {task for task in SUITES["paper"] if "Rotate" not in task}
 
 
 def test_lamps_are_known_by_the_names_of_their_tasks() -> None:

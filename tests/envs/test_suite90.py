@@ -28,7 +28,7 @@ pytestmark = [
 SEED = 4242424242
 N_STEPS = 40  # beyond the reveal of all tasks but the long ones
 TABLE_M = -0.05, 0.6  # of the centre of anything that lies or is held on the table
-STAND_IN = {"mug": "stand_in"}
+STAND_IN = {"mug": "stand_in", "bulb": "stand_in"}
 SCRIPTED = [task for task, row in SUITES["mikasa_vla_90"].items() if row.oracle]
 ORACLES_OF = (
     *("RememberColor9", "RememberShape5", "RememberShapeAndColor3x3", "FindImposterColor5"),
@@ -74,6 +74,16 @@ def test_true_states_are_as_intended_and_an_episode_depends_on_its_seed(task: st
         assert one.reward == two.reward
         for name, value in one.observation.state.items():
             np.testing.assert_array_equal(value, two.observation.state[name])
+    env.close()
+
+
+@pytest.mark.parametrize("task", OFFICIAL_TASKS)
+def test_every_task_can_be_rendered(task: str) -> None:
+    cameras = ("base_camera", "hand_camera")
+    env = make_env(EnvSettings(task=task, kwargs=STAND_IN, cameras=cameras))
+    images = env.reset({0: SEED}, render=True)[0].observation.images
+    assert {name: image.shape for name, image in images.items()} == dict.fromkeys(cameras, (128, 128, 3))
+    assert all(image.std() > 1 for image in images.values())
     env.close()
 
 

@@ -122,7 +122,7 @@ def original_tasks(rows: Iterable[TaskSpec]) -> dict[str, TaskSpec]:
             **_OF_ALL,
         )
         for row in rows
-        if not row.id.startswith("Rotate")
+        if row.suite == "paper" and not row.id.startswith("Rotate")
     )
     return {row.id: row for row in found}
 
