@@ -15,7 +15,7 @@ from vla_eval.errors import TaskArgumentError, UnknownNameError
 from vla_eval.tasks.choice import NO_CHOICE
 from vla_eval.tasks.memory_env import PARK_X_M, MemoryTableEnv
 from vla_eval.tasks.objects.bodies import pose_of
-from vla_eval.tasks.objects.free_places import used_areas
+from vla_eval.tasks.objects.free_places import drawn_poses, used_areas
 
 SEED = 5
 SWAPPED = ("RememberObject5-v0", "BunchOfColors3-v0", "ShellGamePick-v0", "TakeItBack-v0")
@@ -203,3 +203,18 @@ def test_a_class_that_does_not_say_what_it_uses_takes_no_things() -> None:
 def test_every_task_says_which_areas_it_uses() -> None:
     with pytest.raises(AssertionError, match="no task has only these arguments: a"):
         used_areas(a=1)
+
+
+def test_in_a_batch_each_episode_has_its_own_places() -> None:
+    env = make("RememberColor3-v0", clutter=3)
+    env.reset(seed=[SEED])
+    seeds, mask = (7, 8, 9), np.array([True, False, True])
+    drawn = env._clutter.drawn(mask, lambda row: np.random.default_rng(seeds[row]))
+    for index, (_, poses) in enumerate(drawn):
+        for row in (0, 2):
+            rng = np.random.default_rng(seeds[row])
+            x, y, _ = drawn_poses(env._clutter_places_m, rng)[index]
+            np.testing.assert_allclose(poses[row, :2], (x, y), rtol=1e-6)
+            assert np.linalg.norm(poses[row, 3:]) == pytest.approx(1)
+    assert index == 2
+    env.close()
