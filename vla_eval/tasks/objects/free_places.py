@@ -6,7 +6,7 @@ and says nothing about the answer. Knows nothing of simulators.
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -91,12 +91,19 @@ def used_areas(**arguments: Any) -> tuple[Area, ...]:  # Any: plain data of many
         case {"mug": _}:
             return (_mugs(arguments),)
         case {"n_items": n_items, "goal_threshold_m": threshold_m}:
-            reach_m = ITEM_SHIFT_M + max(HAND_M, threshold_m)
-            slots = tuple(Area((x, x), (y, y), reach_m) for x, y in slot_centres_m(n_items).tolist())
             n_cues = n_items if "n_shown" in arguments else 0
             shown = [(0.0, 0.0), *(bunch_place_m(index, n_items) for index in range(n_cues))]
-            return (*slots, *(Area((x, x), (y, y), SHOWN_HALF_M) for x, y in shown))
+            # The hand may go from one item to the next, low over the table.
+            return (
+                _around(slot_centres_m(n_items).tolist(), ITEM_SHIFT_M + max(HAND_M, threshold_m)),
+                _around(shown, SHOWN_HALF_M),
+            )
     raise AssertionError(f"no task has only these arguments: {', '.join(arguments)}")
+
+
+def _around(points_m: Sequence[Sequence[float]], margin_m: float) -> Area:
+    x_m, y_m = zip(*points_m, strict=True)
+    return Area((min(x_m), max(x_m)), (min(y_m), max(y_m)), margin_m)
 
 
 def _mugs(arguments: Mapping[str, Any]) -> Area:
