@@ -1,16 +1,18 @@
 """Other robots than the Panda: the expert solves a task with each, and what cannot be is refused."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from mani_skill import ASSET_DIR
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.control_modes import JOINT_DELTA_POS
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
-from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameError
+from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, UnknownNameError
 from vla_eval.features import proprioception
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_oracle
@@ -23,7 +25,17 @@ from vla_eval.testing.check_env import check_env
 
 TASK = "RememberColor3-v0"
 FETCH = {"robot": "fetch"}
-OTHERS = [arm for arm in ROWS if arm is not PANDA]
+
+
+def is_installed(arm: Arm) -> bool:
+    return not arm.asset or (Path(ASSET_DIR) / "robots" / arm.asset).is_dir()
+
+
+OTHERS = [
+    pytest.param(arm, marks=pytest.mark.skipif(not is_installed(arm), reason=f"no download of {arm.asset}"))
+    for arm in ROWS
+    if arm is not PANDA
+]
 every_other = pytest.mark.parametrize("arm", OTHERS, ids=lambda arm: arm.name)
 
 
@@ -62,6 +74,15 @@ def test_the_expert_touches_the_right_cube_by_motions_of_the_joints(arm: Arm) ->
 def test_the_so100_touches_mugs_and_carries_a_cube(task: str) -> None:
     env = env_with(task=task, kwargs={"robot": "so100"}, privileged=True)
     assert [solve(env, task, seed, n_action_steps=1) for seed in (1, 2)] == ["success", "success"]
+
+
+def test_an_arm_whose_meshes_are_not_there_says_how_to_get_them_and_asks_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("vla_eval.tasks.arm.xarm6.ASSET_DIR", "nowhere")
+    monkeypatch.setattr("builtins.input", lambda *_: pytest.fail("asked for a download"))
+    with pytest.raises(MissingDependencyError, match=r"mani_skill\.utils\.download_asset xarm6"):
+        env_with(kwargs={"robot": "xarm6"})
 
 
 @pytest.mark.slow
