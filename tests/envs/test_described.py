@@ -80,7 +80,7 @@ REFUSED: list[tuple[str, dict[str, Any], type[Exception], str]] = [
         "ShellGameTouch",
         {"robot": "fetch"},
         TaskArgumentError,
-        "Robots that do: panda_wristcam, so100, koch, xarm6",
+        "Robots that do: panda_wristcam, so100, koch, xarm6, widowx",
     ),
     ("SeqOfColors7-v0", {"cue_steps": 17}, TaskArgumentError, "can be 124 together"),
     ("ShellGameTouch-v0", {"mug": "cup"}, TaskArgumentError, "expected 'primitive' or 'ycb'"),

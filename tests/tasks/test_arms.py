@@ -1,11 +1,11 @@
 """Other robots than the Panda: the expert solves a task with each, and what cannot be is refused."""
 
+import importlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from mani_skill import ASSET_DIR
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings, RenderSettings
@@ -28,7 +28,13 @@ FETCH = {"robot": "fetch"}
 
 
 def is_installed(arm: Arm) -> bool:
-    return not arm.asset or (Path(ASSET_DIR) / "robots" / arm.asset).is_dir()
+    """Whether a robot's meshes are there: those of some are a download."""
+    module, _, name = arm.agent.partition(":")
+    try:
+        agent = getattr(importlib.import_module(module), name)
+        return Path(agent.urdf_path.fget(object.__new__(agent)) if arm.asset else __file__).is_file()
+    except MissingDependencyError:
+        return False
 
 
 OTHERS = [
@@ -76,13 +82,14 @@ def test_the_so100_touches_mugs_and_carries_a_cube(task: str) -> None:
     assert [solve(env, task, seed, n_action_steps=1) for seed in (1, 2)] == ["success", "success"]
 
 
+@pytest.mark.parametrize("arm", [arm for arm in ROWS if arm.asset], ids=lambda arm: arm.name)
 def test_an_arm_whose_meshes_are_not_there_says_how_to_get_them_and_asks_nothing(
-    monkeypatch: pytest.MonkeyPatch,
+    arm: Arm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vla_eval.tasks.arm.xarm6.ASSET_DIR", "nowhere")
+    monkeypatch.setattr("vla_eval.tasks.arm.robots.ASSET_DIR", "nowhere")
     monkeypatch.setattr("builtins.input", lambda *_: pytest.fail("asked for a download"))
-    with pytest.raises(MissingDependencyError, match=r"mani_skill\.utils\.download_asset xarm6"):
-        env_with(kwargs={"robot": "xarm6"})
+    with pytest.raises(MissingDependencyError, match=rf"mani_skill\.utils\.download_asset {arm.asset}"):
+        env_with(kwargs={"robot": arm.name})
 
 
 @pytest.mark.slow

@@ -90,6 +90,8 @@ class Arm:
     rest_qpos: tuple[float, ...]
     base_m: Xyz  # position of the root, world frame
     base_yaw_rad: float = 0.0  # and how far it is turned about the vertical
+    # where the tool centre point is, for an agent of ManiSkill that has none; its axes are those of `Chain`
+    tool: Hinge | None = None
     asset: str = ""  # ManiSkill's name of the download that has its meshes; empty: they are in its wheel
     # control mode -> what an action is; the first is the one of an environment for which none is named
     actions: Mapping[str, ActionSpec]

@@ -4,22 +4,19 @@ Its meshes are a download of ManiSkill, which nothing here starts.
 """
 
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import sapien
-from mani_skill import ASSET_DIR
 from mani_skill.agents.controllers import PDJointPosMimicController, PDJointPosMimicControllerConfig
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.xarm6.xarm6_robotiq import XArm6Robotiq
 from mani_skill.sensors.camera import CameraConfig
 
 from vla_eval.control_modes import EE_DELTA_POSE
-from vla_eval.errors import MissingDependencyError
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.rows import XARM6
 from vla_eval.tasks.arm.fetch import StillConfig
-from vla_eval.tasks.arm.robots import KeptConfigs
+from vla_eval.tasks.arm.robots import KeptConfigs, downloaded
 from vla_eval.tasks.interface import CAMERA_FOV_RAD
 
 # 20 N at the pads, which move by 5 cm/rad: the least force of a Robotiq 2F-85 (20 to 235 N, its manual).
@@ -56,18 +53,8 @@ class XArm6AtTable(KeptConfigs, XArm6Robotiq):  # type: ignore[misc]  # ManiSkil
 
     @property
     def urdf_path(self) -> str:
-        """Path of the URDF among ManiSkill's downloads.
-
-        Raises:
-            MissingDependencyError: it is not there.
-        """
-        file = Path(ASSET_DIR) / "robots" / "xarm6" / "xarm6_robotiq.urdf"
-        if not file.is_file():
-            raise MissingDependencyError(
-                f"robot='{XARM6.name}': its meshes are not installed, expected {file}. Install them with "
-                f"`python -m mani_skill.utils.download_asset {XARM6.asset}`, or use another robot."
-            )
-        return str(file)
+        """Path of the URDF among ManiSkill's downloads."""
+        return str(downloaded(XARM6, "xarm6/xarm6_robotiq.urdf"))
 
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
