@@ -1,7 +1,7 @@
 """Everyday things that stand around and are no part of a task, fixed to the table.
 
-Whatever touches none of them moves as without them, to the last bit: they change what is seen, and stop an
-arm that hits them. (Measured: things that can be moved change how others settle, by up to 4e-5.)
+They change what is seen, and stop an arm that hits them. (Measured: things that can be moved change how
+others settle, by up to 4e-5.)
 """
 
 from collections.abc import Callable, Iterator
