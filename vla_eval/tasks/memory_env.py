@@ -93,7 +93,7 @@ class MemoryTableEnv(TensorsOut):
         control_mode: what an action means, see `control_modes`. None: ManiSkill's default for the arm.
         image_size: height and width of the images of both cameras, pixels.
         clutter: how many everyday things are fixed around what the task uses: touching one is no choice.
-            All else is the same for the same seed, and so are the first ones if there are more.
+            All else begins the same for the same seed, and so do the first ones if there are more.
         robot_uids: `panda_wristcam`; `panda_wristcam_seen`, which gives the same images faster;
             `panda_wristcam_light` with a simplified camera mesh; or that of another robot.
     """
