@@ -1,6 +1,6 @@
-"""Render the images of `docs/tasks/*.md`: what the two cameras see in each phase of each task.
+"""Render the images of `docs/tasks/*.md` and `docs/clutter.md`: what the two cameras see of each task.
 
-Usage: .venv/bin/python scripts/task_images.py [DOCS_IMAGES_FOLDER [TASK…]]
+Usage: .venv/bin/python scripts/task_images.py [DOCS_IMAGES_FOLDER [TASK… | clutter]]
 """
 
 import sys
@@ -39,6 +39,15 @@ STEPS = {
 }
 SEED = 1
 GAP_PX = 2
+CLUTTER = "clutter"  # name of the image of tasks with things around them, at the start of the choice
+CLUTTERED = {  # task -> how many things
+    "RememberColor9-v0": 12,
+    "ShellGameTouch-v0": 12,
+    "InterceptMedium-v0": 8,
+    "RotateStrictPos-v0": 12,
+    "TakeItBack-v0": 12,
+}
+CLUTTERED_PX = 160
 
 
 def picture(task: str) -> np.ndarray:
@@ -68,6 +77,17 @@ def picture(task: str) -> np.ndarray:
     return np.concatenate(columns, axis=1)
 
 
+def cluttered(task: str) -> np.ndarray:
+    """Return the (H, W, 3) uint8 RGB column of a task with things around it, base view over wrist view."""
+    kwargs = {CLUTTER: CLUTTERED[task], "image_size": CLUTTERED_PX}
+    env = ManiSkillEnv(EnvSettings(task=task, kwargs=kwargs, cameras=CAMERAS))
+    result = env.reset({0: SEED}, render=True)[0]
+    while result.status.phase != "response":
+        result = env.step({0: env.hold_action(0)}, render=frozenset({0}))[0]
+    env.close()
+    return np.concatenate([_framed(result.observation.images[camera]) for camera in CAMERAS])
+
+
 def _framed(image: np.ndarray) -> np.ndarray:
     return np.pad(image, ((0, GAP_PX), (0, GAP_PX), (0, 0)), constant_values=255)
 
@@ -76,8 +96,10 @@ def main() -> None:
     """Write one PNG per task."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/images")
     folder.mkdir(parents=True, exist_ok=True)
-    for task in sys.argv[2:] or STEPS:
-        cv2.imwrite(str(folder / f"{task}.png"), cv2.cvtColor(picture(task), cv2.COLOR_RGB2BGR))
+    for name in sys.argv[2:] or (*STEPS, CLUTTER):
+        columns = [cluttered(task) for task in CLUTTERED] if name == CLUTTER else [picture(name)]
+        sheet = cv2.cvtColor(np.concatenate(columns, axis=1), cv2.COLOR_RGB2BGR)
+        cv2.imwrite(str(folder / f"{name}.png"), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 if __name__ == "__main__":

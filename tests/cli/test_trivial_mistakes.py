@@ -17,6 +17,9 @@ WRONG_ENV = {
     "--set env.delay_steps=long": "delay_steps",
     "--set env.horizon_steps=8": "no step is left for the choice",
     "--set env.control_mode=pd_ee": "Did you mean 'pd_ee_",
+    "--set env.cluter=3": "Did you mean 'clutter'?",
+    "--set env.clutter=13": "expected 0 to 12",
+    "--set env.goal_threshold_m=5 --set env.clutter=1": "expected at most 0",
     "--set env.robot=so10": "Did you mean 'so100'",
     "--set env.robot=so100 --set env.control_mode=pd_ee_pose": "this arm takes pd_joint_pos",
 }

@@ -76,7 +76,12 @@ REFUSED: list[tuple[str, dict[str, Any], type[Exception], str]] = [
     (COLOR, {"delay_steps": [1, 60]}, TaskArgumentError, "can be 65 together"),
     (COLOR, {"robot_uids": "fetch"}, UnknownNameError, "Did you mean 'fetch_at_table'"),
     ("ShellGameTouch-v0", {"robot_uids": "fetch_at_table"}, TaskArgumentError, "does not solve ShellGameTou"),
-    ("ShellGameTouch", {"robot": "fetch"}, TaskArgumentError, "Robots that do: panda_wristcam, so100, koch"),
+    (
+        "ShellGameTouch",
+        {"robot": "fetch"},
+        TaskArgumentError,
+        "Robots that do: panda_wristcam, so100, koch, xarm6, widowx",
+    ),
     ("SeqOfColors7-v0", {"cue_steps": 17}, TaskArgumentError, "can be 124 together"),
     ("ShellGameTouch-v0", {"mug": "cup"}, TaskArgumentError, "expected 'primitive' or 'ycb'"),
     ("InterceptMedium-v0", {"delay_steps": 5}, UnknownNameError, "no argument 'delay_steps'"),

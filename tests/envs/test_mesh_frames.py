@@ -41,16 +41,17 @@ def _frames(task: str, mesh: Literal["shipped", "whole"]) -> dict[str, ImageArra
 
 
 @pytest.mark.parametrize(
-    ("task", "appearance"),
+    ("task", "clutter", "appearance"),
     [
-        pytest.param("ShellGameTouch-v0", AppearanceSettings(), marks=pytest.mark.slow),
-        ("ChainOfColors3-v0", AppearanceSettings(light=0.6, hue_deg=40, table_rgb=(0.2, 0.4, 0.3))),
+        pytest.param("ShellGameTouch-v0", 0, AppearanceSettings(), marks=pytest.mark.slow),
+        ("ChainOfColors3-v0", 4, AppearanceSettings(light=0.6, hue_deg=40, table_rgb=(0.2, 0.4, 0.3))),
     ],
 )
 def test_the_wrist_camera_s_own_scene_shows_what_the_whole_scene_shows(
-    task: str, appearance: AppearanceSettings
+    task: str, clutter: int, appearance: AppearanceSettings
 ) -> None:
-    env = make_env(EnvSettings(task=task, cameras=CAMERAS, appearance=appearance))
+    settings = EnvSettings(task=task, cameras=CAMERAS, kwargs={"clutter": clutter}, appearance=appearance)
+    env = make_env(settings)
     (inner,), (view,) = env._envs, env._wrist_views
     rng, n_apart = np.random.default_rng(0), 0
     for seed in (1, 2):  # a new scene per episode

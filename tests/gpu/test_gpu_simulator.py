@@ -7,6 +7,7 @@ import pytest
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import make_env
+from vla_eval.tasks.objects.bodies import pose_of
 from vla_eval.testing import check_env
 
 pytestmark = pytest.mark.gpu
@@ -41,3 +42,13 @@ def test_an_episode_does_not_depend_on_the_slots_beside_it() -> None:
 
 def test_the_environment_keeps_its_contract() -> None:
     check_env(lambda: make_env(EnvSettings(task="RememberColor3-v0", sim_backend="gpu")), renders=False)
+
+
+def test_things_beside_a_task_stand_where_they_stand_on_the_cpu() -> None:
+    def places(seeds: list[int], **backend: Any) -> np.ndarray:
+        settings = EnvSettings(task="RememberColor3-v0", kwargs={"clutter": 4}, n_slots=len(seeds), **backend)
+        env: Any = make_env(settings)
+        env.reset(dict(enumerate(seeds)), render=False)
+        return np.stack([pose_of(actor)[-1] for actor in env._envs[0]._clutter._actors])
+
+    assert np.allclose(places([1, 2], sim_backend="gpu"), places([2]), atol=1e-5)

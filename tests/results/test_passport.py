@@ -92,6 +92,7 @@ def test_the_figures_of_each_effect_stand_on_the_page_it_names() -> None:
         ({"env": {"robot": "fetch"}}, "robot"),
         ({"env": {"robot": "of a package that is not installed"}}, "robot"),
         ({"env": {"delay_steps": 5}}, "world"),
+        ({"env": {"clutter": 4}}, "world"),
         ({"env": {"strict_choice": True}}, "success_rule"),
         ({"cue_view": "hidden"}, "world"),
         ({"chunking": {"mode": "receding_horizon", "delay_steps": 2}}, "delay"),

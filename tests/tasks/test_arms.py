@@ -1,5 +1,7 @@
 """Other robots than the Panda: the expert solves a task with each, and what cannot be is refused."""
 
+import importlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from vla_eval.config.environment import EnvSettings, RenderSettings
 from vla_eval.control_modes import JOINT_DELTA_POS
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
-from vla_eval.errors import SpecMismatchError, TaskArgumentError, UnknownNameError
+from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, UnknownNameError
 from vla_eval.features import proprioception
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.controls.scripted import make_oracle
@@ -23,7 +25,23 @@ from vla_eval.testing.check_env import check_env
 
 TASK = "RememberColor3-v0"
 FETCH = {"robot": "fetch"}
-OTHERS = [arm for arm in ROWS if arm is not PANDA]
+
+
+def is_installed(arm: Arm) -> bool:
+    """Whether a robot's meshes are there: those of some are a download."""
+    module, _, name = arm.agent.partition(":")
+    try:
+        agent = getattr(importlib.import_module(module), name)
+        return Path(agent.urdf_path.fget(object.__new__(agent)) if arm.asset else __file__).is_file()
+    except MissingDependencyError:
+        return False
+
+
+OTHERS = [
+    pytest.param(arm, marks=pytest.mark.skipif(not is_installed(arm), reason=f"no download of {arm.asset}"))
+    for arm in ROWS
+    if arm is not PANDA
+]
 every_other = pytest.mark.parametrize("arm", OTHERS, ids=lambda arm: arm.name)
 
 
@@ -62,6 +80,16 @@ def test_the_expert_touches_the_right_cube_by_motions_of_the_joints(arm: Arm) ->
 def test_the_so100_touches_mugs_and_carries_a_cube(task: str) -> None:
     env = env_with(task=task, kwargs={"robot": "so100"}, privileged=True)
     assert [solve(env, task, seed, n_action_steps=1) for seed in (1, 2)] == ["success", "success"]
+
+
+@pytest.mark.parametrize("arm", [arm for arm in ROWS if arm.asset], ids=lambda arm: arm.name)
+def test_an_arm_whose_meshes_are_not_there_says_how_to_get_them_and_asks_nothing(
+    arm: Arm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vla_eval.tasks.arm.robots.ASSET_DIR", "nowhere")
+    monkeypatch.setattr("builtins.input", lambda *_: pytest.fail("asked for a download"))
+    with pytest.raises(MissingDependencyError, match=rf"mani_skill\.utils\.download_asset {arm.asset}"):
+        env_with(kwargs={"robot": arm.name})
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 from tests.tasks import made_tasks
 from vla_eval.errors import TaskArgumentError
 from vla_eval.tasks.memory_env import PARK_X_M
-from vla_eval.tasks.sequences import bunch_place_m
+from vla_eval.tasks.objects.layout import bunch_place_m
 
 ABOVE_CUBE_M = np.array([0.0, 0.0, 0.036])  # within 2 cm of the point to touch, 1 cm over the cube
 

@@ -8,6 +8,7 @@ import pytest
 from numpy.typing import NDArray
 
 from vla_eval.oracles.hover import CUBES
+from vla_eval.tasks.objects.free_places import THING_HEIGHT_M
 from vla_eval.tasks.objects.items import Primitive, Shape
 from vla_eval.tasks.objects.layout import MIXED_MIN_DISTANCE_M
 from vla_eval.tasks.objects.things import THINGS
@@ -49,6 +50,9 @@ class TestEachThing:
     def test_lies_within_half_the_distance_of_two_places(self, thing: Shape) -> None:
         reach_m = np.linalg.norm(points_of(thing)[:, :2], axis=1).max()
         assert 0.01 < reach_m <= MIXED_MIN_DISTANCE_M / 2
+
+    def test_is_no_higher_than_what_places_beside_a_task_are_for(self, thing: Shape) -> None:
+        assert np.ptp(points_of(thing)[:, 2]) <= THING_HEIGHT_M
 
     def test_rests_on_the_table(self, thing: Shape) -> None:
         assert points_of(thing)[:, 2].min() == pytest.approx(-thing.rest_height_m, abs=0.05 * MM)

@@ -42,7 +42,7 @@ class Gripper:
     def command(self, width_m: float) -> float:
         """Return the last number of an action, in [-1, 1], that brings the fingers this far apart."""
         if self.gaps_m:
-            positions, gaps_m = zip(*self.gaps_m, strict=True)
+            positions, gaps_m = zip(*sorted(self.gaps_m, key=lambda pair: pair[1]), strict=True)
             position = float(np.interp(width_m, gaps_m, positions))
         else:
             position = width_m / len(self.joints)
@@ -90,6 +90,9 @@ class Arm:
     rest_qpos: tuple[float, ...]
     base_m: Xyz  # position of the root, world frame
     base_yaw_rad: float = 0.0  # and how far it is turned about the vertical
+    # where the tool centre point is, for an agent of ManiSkill that has none; its axes are those of `Chain`
+    tool: Hinge | None = None
+    asset: str = ""  # ManiSkill's name of the download that has its meshes; empty: they are in its wheel
     # control mode -> what an action is; the first is the one of an environment for which none is named
     actions: Mapping[str, ActionSpec]
     # for an arm without a control mode of the hand's pose: what scripted controls need to move its joints

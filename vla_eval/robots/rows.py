@@ -170,5 +170,73 @@ KOCH = Arm(
     },
 )
 
-ROWS = (PANDA, FETCH, SO100, KOCH)
+XARM6 = Arm(
+    name="xarm6",
+    agent="vla_eval.tasks.arm.xarm6:XArm6AtTable",
+    uids=("xarm6_at_table",),
+    description="UFactory xArm 6 with a Robotiq 2F-85 gripper; its meshes are a download of ManiSkill",
+    asset="xarm6",
+    joints=(
+        *(f"joint{i}" for i in range(1, 7)),
+        *("left_outer_knuckle_joint", "left_inner_knuckle_joint"),
+        *("right_outer_knuckle_joint", "right_inner_knuckle_joint"),
+        *("left_inner_finger_joint", "right_inner_finger_joint"),
+    ),
+    arm_joints=tuple(range(6)),
+    # The distance of the pads in the simulator; at 4 and 5 cm with a cube and a peg between them.
+    gripper=Gripper(
+        joints=(6, 8),
+        closed=0.81,
+        opened=0.0,
+        gaps_m=(
+            *((0.0, 0.0846), (0.162, 0.0698), (0.32, 0.05)),
+            *((0.4655, 0.04), (0.648, 0.0175), (0.81, 0.0)),
+        ),
+    ),
+    # The tool centre point is at (-0.07, 0, 0.318), pointing down, as the Panda's.
+    rest_qpos=(0.0, -0.0017, -1.3846, 0.0, 1.3864, *(0.0,) * 7),
+    base_m=(-0.55, 0.0, 0.0),
+    actions={EE_DELTA_POSE: CONTROL_MODES[EE_DELTA_POSE]},
+    not_solved={
+        "Intercept": "the ball rolls on between its fingers, which the expert does not close far enough",
+        **dict.fromkeys(
+            ("RotateLenient", "RotateStrict"),
+            "its fingers are driven one by one and drift with the peg: a blind arm often succeeds, too",
+        ),
+    },
+)
+
+# So near that it reaches the farthest mugs.
+WIDOWX = Arm(
+    name="widowx",
+    agent="vla_eval.tasks.arm.widowx:WidowXAtTable",
+    uids=("widowx_at_table",),
+    description="Trossen WidowX 250 S, the arm of BridgeData; its meshes are a download of ManiSkill",
+    asset="widowx250s",
+    joints=(
+        *("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate"),
+        *("left_finger", "right_finger"),
+    ),
+    arm_joints=tuple(range(6)),
+    # The distance of the fingers' inner sides in the simulator: they do not close altogether.
+    gripper=Gripper(closed=0.015, opened=0.037, gaps_m=((0.015, 0.0073), (0.037, 0.0512))),
+    # Between the fingers, 1.6 cm above their lowest point.
+    tool=Hinge(origin_m=(0.0, 0.0, 0.0), rpy_rad=(np.pi, -_QUARTER, 0.0), axis=(0.0, 0.0, 1.0)),
+    rest_qpos=(0.0, 0.0204, -0.2177, 0.0, 1.768, 0.0, 0.037, 0.037),
+    base_m=(-0.32, 0.0, 0.0),
+    actions={EE_DELTA_POSE: CONTROL_MODES[EE_DELTA_POSE]},
+    not_solved={
+        **dict.fromkeys(
+            ("BunchOfColors", "SeqOfColors", "ChainOfColors"),
+            "it moves so slowly that seven cubes take longer than an episode",
+        ),
+        "ShellGamePick": "its fingers do not hold the mug by its handle",
+        **_IN_THE_LANE,
+        **dict.fromkeys(
+            ("RotateLenient", "RotateStrict"), "its fingers open 5.1 cm, and the peg has a width of 5 cm"
+        ),
+    },
+)
+
+ROWS = (PANDA, FETCH, SO100, KOCH, XARM6, WIDOWX)
 """In the order in which they are listed."""

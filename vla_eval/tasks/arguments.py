@@ -20,6 +20,8 @@ from vla_eval.tasks.arm.arms import WRIST_MESH_ROBOTS
 from vla_eval.tasks.catalog import TASKS, family_of
 from vla_eval.tasks.interface import CONTROL_HZ, IMAGE_SIZE, StepRange, cameras, states, step_range
 from vla_eval.tasks.objects import limits
+from vla_eval.tasks.objects.free_places import free_places_m, free_things, used_areas
+from vla_eval.tasks.objects.item_names import item_names
 from vla_eval.tasks.objects.limits import LIMITED, check_together, n_swaps
 from vla_eval.tasks.source import class_constant, task_arguments
 from vla_eval.tasks.spec import TaskSpec, total_cue_steps
@@ -28,7 +30,7 @@ HORIZON = "horizon_steps"
 OF_EVERY_TASK: Mapping[str, str] = {HORIZON: "SomeSteps", ROBOT: "str", ROBOT_UIDS: "str"}
 """Arguments that no class takes -> their annotation."""
 OWN = "vla_eval.tasks."
-"""Classes of other packages may count otherwise which other cues there are."""
+"""Classes of other packages may count otherwise which other cues and free places there are."""
 CHOICE_ARGUMENTS = ("strict_choice", "show_cue", "cue_after_steps")
 """Arguments that only tasks with candidates have."""
 ANNOTATIONS: Mapping[str, Any] = {  # Any: type annotations
@@ -111,6 +113,10 @@ def _with_usual(spec: TaskSpec, given: Mapping[str, object]) -> dict[str, Any]: 
         found["n_items"] = spec.n_candidates(given)
     if spec.entry_point.startswith(OWN):
         found["n_swaps"] = n_swaps(**found)
+        if found["clutter"]:
+            places_m = free_places_m(used_areas(**found), base_m=robot_of(given).base_m)
+            items = item_names(family_of(spec), spec.n_candidates(given))
+            found |= {"n_free_places": len(places_m), "n_free_things": len(free_things(items))}
     if "delay_steps" in found:
         found["least_delay"], _ = step_range("delay_steps", found["delay_steps"])
     return {**found, "one_by_one": spec.shows_one_by_one}

@@ -13,11 +13,11 @@ from vla_eval.seeding import Stream
 from vla_eval.tasks.memory_env import poses
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Body, Flags, moving_body, position_of, velocity_of
+from vla_eval.tasks.objects.free_places import Area, used_areas
+from vla_eval.tasks.objects.layout import SPAWN_X_M, SPAWN_Y_M
 from vla_eval.tasks.objects.limits import BodySize
 from vla_eval.tasks.without_cue import WithoutCueEnv
 
-SPAWN_X_M = (-0.35, -0.05)
-SPAWN_Y_M = (-0.9, -0.65)
 SIDE_VELOCITY_M_S = (0.0, 0.05)
 
 
@@ -88,6 +88,10 @@ class RollingBallEnv(WithoutCueEnv):
         self.move(self.ball, mask, poses(self._start))
         with self._only(mask):
             self.ball.set_linear_velocity(torch.as_tensor(self._initial_velocity[mask], device=self.device))
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where the ball can roll, with the hand behind it."""
+        return used_areas(ball_radius_m=self.ball_radius_m)
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `ball`."""

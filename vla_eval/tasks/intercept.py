@@ -21,12 +21,12 @@ from vla_eval.tasks.objects.bodies import (
     spin_of,
     velocity_of,
 )
+from vla_eval.tasks.objects.free_places import Area, used_areas
 from vla_eval.tasks.objects.items import Z_UP_WXYZ
+from vla_eval.tasks.objects.layout import DISC_Y_M, GOAL_OFFSET_X_M
 from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
 
-GOAL_OFFSET_X_M = 0.2
-GOAL_Y_M = (-0.2, 0.2)
 GOAL_Z_M = 0.001
 HIT_OFFSET_M = 0.07  # distance of the reward's hit point behind the ball, seen from the goal
 HIT_REACHED_M = 0.04
@@ -80,7 +80,7 @@ class InterceptEnv(RollingBallEnv):
         self._hit_point_reached: Flags = np.zeros(self.num_envs, dtype=np.bool_)
 
     def _sample_goal(self, env: int, layout: np.random.Generator, *, lane_x_m: float) -> None:
-        self._goal_position[env] = (lane_x_m + GOAL_OFFSET_X_M, layout.uniform(*GOAL_Y_M), GOAL_Z_M)
+        self._goal_position[env] = (lane_x_m + GOAL_OFFSET_X_M, layout.uniform(*DISC_Y_M), GOAL_Z_M)
 
     def _on_episode_start(self, mask: Flags) -> None:
         self._hit_point_reached[mask] = False
@@ -106,6 +106,10 @@ class InterceptEnv(RollingBallEnv):
             "reached_status": self._hit_point_reached.copy(),
             "is_robot_static": self.is_static(),
         }
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where the ball can roll and the disc can lie, with the hand behind the ball."""
+        return used_areas(ball_radius_m=self.ball_radius_m, goal_radius_m=self.goal_radius_m)
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `ball` and `goal`."""

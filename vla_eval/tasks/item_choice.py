@@ -14,6 +14,7 @@ from vla_eval.tasks.choice import ChoiceEnv
 from vla_eval.tasks.memory_env import CueSize, Place
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
+from vla_eval.tasks.objects.free_places import Area, free_things, used_areas
 from vla_eval.tasks.objects.items import Item, build_decoy, build_item
 from vla_eval.tasks.objects.layout import Plane, jittered, slot_centres_m
 from vla_eval.tasks.objects.limits import StepCount
@@ -133,6 +134,14 @@ class ItemChoiceEnv(ChoiceEnv):
         self.move(self.candidates[index], moved if self._hides_items else seen, pose)
         if self._hides_items:
             self.move(self.decoys[index], seen, pose)
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where items can lie and be shown, with the hand over them."""
+        return used_areas(n_items=self.n_items, goal_threshold_m=self.goal_threshold_m)
+
+    def free_things(self) -> tuple[str, ...]:
+        """Return the names of the everyday things that are none of the items."""
+        return free_things({item.name for item in self.items})
 
     def cue_places_m(self, env: int) -> list[Place]:
         """Return where items are shown as the cue, on the table, world frame."""

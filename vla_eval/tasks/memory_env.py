@@ -24,16 +24,27 @@ from mani_skill.utils.scene_builder.table import TableSceneBuilder
 from mani_skill.utils.structs import Actor, Pose
 
 from vla_eval.core import FloatArray
+from vla_eval.errors import TaskArgumentError
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.arm import Arm
 from vla_eval.robots.find import robot_with_uid
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
 from vla_eval.tasks.arm.robots import ParsedArms, kept_loader
-from vla_eval.tasks.interface import CAMERA_FOV_RAD, StepRange, step_range
+from vla_eval.tasks.interface import (
+    BASE_CAMERA_EYE_M,
+    BASE_CAMERA_TARGET_M,
+    CAMERA_FOV_RAD,
+    StepRange,
+    step_range,
+)
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Body, Flags, Indices, Steps, anywhere, place, velocity_of
-from vla_eval.tasks.objects.limits import ImageSize, NotNegative, Positive
+from vla_eval.tasks.objects.clutter import Clutter
+from vla_eval.tasks.objects.free_places import Area, free_places_m
+from vla_eval.tasks.objects.item_names import THING_NAMES
+from vla_eval.tasks.objects.layout import Plane
+from vla_eval.tasks.objects.limits import ClutterCount, ImageSize, NotNegative, Positive
 from vla_eval.tasks.tensors_out import Info, TensorsOut
 
 QPOS_NOISE_RAD = 0.02
@@ -81,6 +92,8 @@ class MemoryTableEnv(TensorsOut):
             contact).
         control_mode: what an action means, see `control_modes`. None: ManiSkill's default for the arm.
         image_size: height and width of the images of both cameras, pixels.
+        clutter: how many everyday things are fixed around what the task uses: touching one is no choice.
+            All else begins the same for the same seed, and so do the first ones if there are more.
         robot_uids: `panda_wristcam`; `panda_wristcam_seen`, which gives the same images faster;
             `panda_wristcam_light` with a simplified camera mesh; or that of another robot.
     """
@@ -99,6 +112,7 @@ class MemoryTableEnv(TensorsOut):
         robot_uids: str = "panda_wristcam",
         control_mode: str | None = None,
         image_size: ImageSize = IMAGE_SIZE_PX,
+        clutter: ClutterCount = 0,
         cue_steps: StepRange = 5,
         delay_steps: StepRange = 5,
         swap_cue: NotNegative = 0,
@@ -128,6 +142,9 @@ class MemoryTableEnv(TensorsOut):
         self.arm: Arm = robot_with_uid(robot_uids, where=f"robot_uids of {type(self).__name__}")
         importlib.import_module(self.arm.agent.partition(":")[0])  # registers it with ManiSkill
         limits.check(Positive, static_threshold_rad_s=static_threshold_rad_s)
+        limits.check(ClutterCount, clutter=clutter)
+        self.clutter = clutter
+        self._clutter_places_m = self._free_places_m() if clutter else np.zeros((0, 2))
         self._parsed_arms: ParsedArms = {}
         # Without it an unseeded reset would repeat the last episode: ManiSkill then keeps the old seed.
         kwargs.setdefault("enhanced_determinism", True)
@@ -151,9 +168,25 @@ class MemoryTableEnv(TensorsOut):
         """Return how many other cues the same scene could have; `swap_cue` selects one of them."""
         raise NotImplementedError
 
+    def _free_places_m(self) -> Plane:
+        places_m = free_places_m(self.used_areas(), base_m=self.arm.base_m)
+        n_free = {"n_free_things": len(self.free_things()), "n_free_places": len(places_m)}
+        limits.check_together(clutter=self.clutter, **n_free)
+        return places_m
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return the areas of the table that objects and hand can use in any episode of this task."""
+        raise TaskArgumentError(
+            f"clutter: {type(self).__name__} has no method `used_areas`. Define it, or leave clutter out."
+        )
+
+    def free_things(self) -> tuple[str, ...]:
+        """Return the names of the everyday things that are no candidates of this task."""
+        return THING_NAMES
+
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = _look_at((0.3, 0, 0.6), (-0.1, 0, 0.1))
+        pose = _look_at(BASE_CAMERA_EYE_M, BASE_CAMERA_TARGET_M)
         return [CameraConfig("base_camera", pose, IMAGE_SIZE_PX, IMAGE_SIZE_PX, CAMERA_FOV_RAD, 0.01, 100)]
 
     @property
@@ -190,6 +223,8 @@ class MemoryTableEnv(TensorsOut):
         self._response_step: Steps = np.zeros(self.num_envs, dtype=np.int32)
         self._cue_end_step = np.zeros_like(self._response_step)
         self._load_items()
+        things = self.free_things()[: self.clutter]
+        self._clutter = Clutter(self.scene, things, self._clutter_places_m, parked=self.parking_pose)
 
     def _load_items(self) -> None:
         """Build the objects of the task, each at `parking_pose(...)`."""
@@ -217,6 +252,9 @@ class MemoryTableEnv(TensorsOut):
             self._sample_episode(env)
         mask = np.zeros(self.num_envs, dtype=np.bool_)
         mask[env_idx.cpu().numpy()] = True
+        clutter_rng = functools.partial(self.episode_generator, stream=Stream.CLUTTER)
+        for actor, standing in self._clutter.drawn(mask, clutter_rng):
+            self.move(actor, mask, standing)
         self._on_episode_start(mask)
         self._on_phase_edges(np.zeros_like(self._response_step), mask)
 

@@ -26,11 +26,12 @@ from vla_eval.tasks.objects.bodies import (
     wrapped_rad,
     yaw_rad,
 )
+from vla_eval.tasks.objects.free_places import Area, used_areas
+from vla_eval.tasks.objects.layout import PEG_RANGE_M
 from vla_eval.tasks.objects.limits import BodySize, Positive
 from vla_eval.tasks.tensors_out import Info
 from vla_eval.tasks.without_cue import WithoutCueEnv
 
-PEG_RANGE_M = 0.1  # the peg's centre is within ± this in x and y
 PEG_RGBA = (12 / 255, 42 / 255, 160 / 255, 1.0)
 LENIENT_REACH_M = 0.1
 STRICT_REACH_M = 0.04
@@ -158,6 +159,11 @@ class RotateEnv(WithoutCueEnv):
     def prompt(self) -> FloatArray:
         """Return (B, 1): the angle to turn the peg by, rad, counterclockwise seen from above."""
         return self._target_angle[:, None]
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where the peg can lie and turn, with the hand around it."""
+        length_m, width_m, _ = self.peg_half_sizes_m
+        return used_areas(peg_half_length_m=length_m, peg_half_width_m=width_m)
 
     def _turned_rad(self) -> FloatArray:
         return wrapped_rad(yaw_rad(pose_of(self.peg)[:, 3:]) - self._first_yaw)

@@ -3,7 +3,6 @@
 They differ in how the cubes are shown (together, or one after another) and whether the order counts.
 """
 
-import math
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,9 @@ from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.memory_env import Place, nearness
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
+from vla_eval.tasks.objects.free_places import Area, used_areas
 from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, Item, cube
+from vla_eval.tasks.objects.layout import bunch_place_m
 from vla_eval.tasks.objects.limits import (
     CubeHalfSize,
     ItemCount,
@@ -30,25 +31,11 @@ from vla_eval.tasks.tensors_out import Info
 
 TOUCH_ABOVE_TOP_M = 0.005  # the point to touch: official 2.5 cm over the centre of a cube of 4 cm
 TOUCH_RADIUS_M = 0.02
-# Cubes that are shown together lie on an arc, compressed in y by this much per place (official constants).
-BUNCH_RADIUS_M = 0.22
-BUNCH_SQUEEZE_M = 0.015
 FOUND_REWARD = 90.0
 MISTAKE_REWARD = -10.0
 
 Order = NDArray[np.int64]
 """(L,) the cubes that are shown, in their order."""
-
-
-def bunch_place_m(color: int, n_colors: int) -> tuple[float, float]:
-    """Return the (x, y) of the cube of this colour while cubes are shown together, world frame.
-
-    Source: official task code, constants as measured (`docs/tasks.md`); other numbers of colours follow
-    the same rule.
-    """
-    rank = color - n_colors // 2
-    angle = math.pi * rank / n_colors
-    return BUNCH_RADIUS_M * math.cos(angle), BUNCH_RADIUS_M * math.sin(angle) - BUNCH_SQUEEZE_M * rank
 
 
 class SeveralColorsEnv(ItemChoiceEnv):
@@ -199,6 +186,10 @@ class SeveralColorsEnv(ItemChoiceEnv):
         distracts = self._distract(step, mask)
         self._reveal_all(choice_begins)
         return anywhere(moved | cue_ends | distracts | choice_begins)
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where cubes can lie and be shown, with the hand over them."""
+        return used_areas(n_items=self.n_items, n_shown=self.n_shown, goal_threshold_m=self.goal_threshold_m)
 
     def cue_places_m(self, env: int) -> list[Place]:
         """Return where cubes are shown: in turn at the same place, or each at its own."""

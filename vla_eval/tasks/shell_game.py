@@ -19,12 +19,12 @@ from vla_eval.tasks.memory_env import CueSize, Place, Wxyz, poses
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects import mug as mugs
 from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere, pose_of, position_of_one
+from vla_eval.tasks.objects.free_places import Area, used_areas
+from vla_eval.tasks.objects.layout import LAYOUT_HALF_RANGE_M, MUG_SPACING_M
 from vla_eval.tasks.objects.limits import Positive
 from vla_eval.tasks.tensors_out import Info
 
 N_MUGS = 3
-MUG_SPACING_M = 0.2
-LAYOUT_HALF_RANGE_M = 0.1
 BALL_RADIUS_M = 0.02
 MUG_REST_Z_M = mugs.HEIGHT_M / 2  # the official 0.04 would sink the mug 0.5 mm into the table
 _NORM = math.sqrt(1.25)
@@ -95,6 +95,10 @@ class ShellGameEnv(ChoiceEnv):
         x, y = layout.uniform(-LAYOUT_HALF_RANGE_M, LAYOUT_HALF_RANGE_M, 2)
         for index in range(N_MUGS):
             self._slots[env, index] = (x, y + (index - 1) * MUG_SPACING_M, MUG_REST_Z_M)
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where the ball can lie and mugs can stand, with the hand beside or over them."""
+        return used_areas(mug=self.mug, goal_threshold_m=self.goal_threshold_m)
 
     def cue_places_m(self, env: int) -> list[Place]:
         """Return where the ball is shown."""

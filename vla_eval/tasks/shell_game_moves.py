@@ -25,6 +25,7 @@ from vla_eval.tasks.objects.bodies import (
     velocity_of,
     yaw_rad,
 )
+from vla_eval.tasks.objects.free_places import Area, used_areas
 from vla_eval.tasks.objects.limits import LiftHeight, Positive
 from vla_eval.tasks.shell_game import BALL_RADIUS_M, N_MUGS, ShellGameEnv
 from vla_eval.tasks.tensors_out import Info
@@ -125,9 +126,14 @@ class ShellGamePushEnv(ShellGameMoveEnv):
     ) -> None:
         limits.check(Positive, push_distance_m=push_distance_m)
         limits.check_together(goal_threshold_m=goal_threshold_m, push_distance_m=push_distance_m)
+        self.push_distance_m = push_distance_m
         self.goal_offset_m = (push_distance_m, 0.0, GOAL_ABOVE_BALL_M)
         self.chosen_m = min(CHOSEN_M, push_distance_m - goal_threshold_m)
         super().__init__(*args, goal_threshold_m=goal_threshold_m, **kwargs)
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where mugs can stand and be pushed, with the hand behind them."""
+        return used_areas(mug=self.mug, push_distance_m=self.push_distance_m)
 
     def reward_terms(self, info: Info) -> Info:
         """Reach the right mug and push it, once the mugs stand there."""
@@ -177,6 +183,10 @@ class ShellGamePickEnv(ShellGameMoveEnv):
         super().__init__(
             *args, goal_threshold_m=lift_height_m if goal_threshold_m is None else goal_threshold_m, **kwargs
         )
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where mugs can stand, with the hand at their handles."""
+        return used_areas(mug=self.mug, lift_height_m=self.lift_height_m)
 
     def is_placed(self, reach_m: FloatArray) -> Flags:
         """Return (B,) bool: the right mug has been lifted high enough."""

@@ -22,6 +22,7 @@ from vla_eval.tasks.objects.bodies import (
     resting_body,
     velocity_of,
 )
+from vla_eval.tasks.objects.free_places import Area, used_areas
 from vla_eval.tasks.objects.items import Z_UP_WXYZ
 from vla_eval.tasks.objects.layout import GOAL_X_M, GOAL_Y_M, START_BAND_WIDTH_M, START_BANDS_Y_M, START_X_M
 from vla_eval.tasks.objects.limits import BodySize, GoalRadius, Positive
@@ -167,6 +168,14 @@ class TakeItBackEnv(WithoutCueEnv):
             "goal_reached_status": self._goal_reached.copy(),
             "is_robot_static": self.is_static(),
         }
+
+    def used_areas(self) -> tuple[Area, ...]:
+        """Return where cube and disc can lie, with the hand around the cube on its way."""
+        return used_areas(
+            goal_radius_m=self.goal_radius_m,
+            return_radius_m=self.return_radius_m,
+            cube_half_size_m=self.cube_half_size_m,
+        )
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return `cube`, `goal`, `first_place` and `violet_disc`, which is below the table while red."""

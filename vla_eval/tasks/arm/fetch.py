@@ -27,7 +27,9 @@ class _Still(PassiveController):  # type: ignore[misc]  # ManiSkill is untyped
 
 
 @dataclass
-class _StillConfig(PassiveControllerConfig):  # type: ignore[misc]  # ManiSkill is untyped
+class StillConfig(PassiveControllerConfig):  # type: ignore[misc]  # ManiSkill is untyped
+    """Joints without a command, held or left free by their damping."""
+
     controller_cls = _Still
 
 
@@ -56,7 +58,7 @@ class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:  # Any: ManiSkill's configurations
         """Fetch's own, except base, torso and head, which are held by damping and take no command."""
-        still = _StillConfig(
+        still = StillConfig(
             self.base_joint_names + self.body_joint_names, damping=HOLDING, force_limit=HOLDING
         )
         return {

@@ -11,11 +11,13 @@ from pathlib import Path
 from typing import Any, ClassVar  # ManiSkill is untyped
 from xml.etree import ElementTree
 
-from mani_skill import PACKAGE_ASSET_DIR
+from mani_skill import ASSET_DIR, PACKAGE_ASSET_DIR
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.panda.panda_wristcam import PandaWristCam
 from mani_skill.utils.building.urdf_loader import URDFLoader
 
+from vla_eval.errors import MissingDependencyError
+from vla_eval.robots.arm import Arm
 from vla_eval.storage.cache import cached
 from vla_eval.storage.drafts import appearing
 from vla_eval.tasks.arm.camera_mesh import (
@@ -55,6 +57,21 @@ def changed_urdf(name: str, change: MeshChange) -> Path:
         tree.write(draft / urdf.name)
         (draft / f"panda_v3_{name}.srdf").write_bytes((_PANDA_DIR / "panda_v3.srdf").read_bytes())
     return urdf
+
+
+def downloaded(arm: Arm, file: str) -> Path:
+    """Return the path of a robot's file among ManiSkill's downloads, `xarm6/xarm6_robotiq.urdf`.
+
+    Raises:
+        MissingDependencyError: it is not there. Nothing is ever downloaded from here.
+    """
+    path = Path(ASSET_DIR) / "robots" / file
+    if not path.is_file():
+        raise MissingDependencyError(
+            f"robot='{arm.name}': its meshes are not installed, expected {path}. Install them with "
+            f"`python -m mani_skill.utils.download_asset {arm.asset}`, or use another robot."
+        )
+    return path
 
 
 ParsedArms = dict[str, Any]

@@ -167,6 +167,13 @@ def build_item(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose) 
     return builder.build(name=item.name)
 
 
+def build_fixed(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose) -> Actor:
+    """Build a kinematic actor that looks like an item and stops what runs into it, as the table does."""
+    builder = _item_builder(scene, item)
+    builder.initial_pose = initial_pose
+    return builder.build_kinematic(name=item.name)
+
+
 def build_decoy(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose) -> Actor:
     """Build a kinematic actor that looks like an item and touches nothing."""
     builder = _item_builder(scene, item)

@@ -1,4 +1,4 @@
-"""Positions of items on the table: a row or an arc of places, each shifted a little per episode.
+"""Where objects can lie on the table: places of items, each shifted a little per episode, and ranges.
 
 Knows nothing of the items, of phases or of a simulator.
 """
@@ -16,6 +16,21 @@ MIXED_MIN_DISTANCE_M = 0.061  # a cross is 6 cm wide
 SQUEEZE_M = {5: 0.025, 9: 0.025}
 
 ARC_CENTRE_X_M = -0.25  # the places of the official arc lie around (-0.25, 0)
+
+# Cubes that are shown together lie on an arc, compressed in y by this much per place (official constants).
+BUNCH_RADIUS_M = 0.22
+BUNCH_SQUEEZE_M = 0.015
+
+MUG_SPACING_M = 0.2  # the shell game: three mugs in a row along y
+LAYOUT_HALF_RANGE_M = 0.1  # of its centre, in x and y
+
+PEG_RANGE_M = 0.1  # Rotate: the peg's centre is within ± this in x and y
+
+# Intercept: where the ball's centre is at the start, and the disc, so far beyond its lane.
+SPAWN_X_M = (-0.35, -0.05)
+SPAWN_Y_M = (-0.9, -0.65)
+GOAL_OFFSET_X_M = 0.2
+DISC_Y_M = (-0.2, 0.2)
 
 # TakeItBack: where the cube can lie at the start, and its goal.
 START_X_M = (-0.05, 0.05)
@@ -48,6 +63,17 @@ def slot_centres_m(n_items: int) -> Plane:
             for rank, angle in zip(ranks, angles, strict=True)
         ]
     )
+
+
+def bunch_place_m(color: int, n_colors: int) -> tuple[float, float]:
+    """Return the (x, y) of the cube of this colour while cubes are shown together, world frame.
+
+    Source: official task code, constants as measured (`docs/tasks.md`); other numbers of colours follow
+    the same rule.
+    """
+    rank = color - n_colors // 2
+    angle = math.pi * rank / n_colors
+    return BUNCH_RADIUS_M * math.cos(angle), BUNCH_RADIUS_M * math.sin(angle) - BUNCH_SQUEEZE_M * rank
 
 
 def places_from_right(positions_m: Plane) -> tuple[int, ...]:

@@ -44,6 +44,7 @@ Positive = Annotated[float, Limits(0, above=True)]
 NotNegative = Annotated[int, Limits(0)]
 ItemCount = Annotated[int, Limits(2, len(COLOR_NAMES))]  # one per colour, or per shape: there are as many
 ThingCount = Annotated[int, Limits(2, len(THING_NAMES))]
+ClutterCount = Annotated[int, Limits(0, len(THING_NAMES))]
 ShownCount = Annotated[int, Limits(1, len(COLOR_NAMES))]
 MixedShapeCount = Annotated[int, Limits(1, len(MIXED_SHAPE_NAMES))]
 MixedColorCount = Annotated[int, Limits(1, N_MIXED_COLORS)]
@@ -178,6 +179,16 @@ RULES: tuple[Callable[..., bool | str], ...] = (
         distract_steps
         and n_swaps <= int(swap_cue > 0)
         and f"distract_steps={distract_steps}: every item is right or shown, so none is left for it."
+    ),
+    lambda clutter, n_free_things: (
+        clutter > n_free_things
+        and f"clutter={clutter}: expected at most {n_free_things}: the other everyday things are candidates "
+        "of this task."
+    ),
+    lambda clutter, n_free_places: (
+        clutter > n_free_places
+        and f"clutter={clutter}: expected at most {n_free_places}: no more places of the table are clear of "
+        "what this task uses, and in the base camera's view."
     ),
     lambda move_in_delay, control_mode: (
         move_in_delay
