@@ -311,6 +311,10 @@ class MemoryTableEnv(TensorsOut):
         """Return name -> body of the objects that an expert may see in addition to candidates."""
         return {}
 
+    def wording(self, env: int) -> dict[str, str]:
+        """Return what stands for the words in braces of the instruction in one environment's episode."""
+        return {}
+
     def cue_places_m(self, env: int) -> list[Place]:
         """Return where objects are shown as the cue of one environment's episode, each on the table."""
         raise NotImplementedError
