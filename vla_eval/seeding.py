@@ -32,6 +32,7 @@ class Stream(IntEnum):
     AGENT = 11
     DELAY = 12
     MEMORY = 13
+    REAL_PLAN = 14
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,6 +13,7 @@ from vla_eval.task_state import Phase
 
 COLORS = ("red", "green", "blue")
 """The cubes, in the order of their indices as candidates."""
+PLACES = ("on the arm's right", "in the middle", "on the arm's left")
 CHANCE = 1 / len(COLORS)
 """Success rate of a perfect arm that knows neither sentence nor cue."""
 EPISODES_PER_COLOR = 10
@@ -27,7 +28,8 @@ class StagePhase(NamedTuple):
     """A part of an episode, begun by the operator; the arm is held still in all but the last."""
 
     phase: Phase  # what it is to a memory
-    asks: str  # what the operator does before it begins; `{color}`, `{others}`: of the episode
+    # what the operator does before it begins; `{color}`, `{others}`, `{place}`, `{order}`: of the episode
+    asks: str
     twin_steps: int  # how long it takes in the simulated twin; 0 for the last, which lasts until the end
 
 
@@ -65,14 +67,15 @@ def _paper(**rates: tuple[float, float]) -> dict[str, Rates]:
     return {name: Rates(*pair) for name, pair in rates.items()}
 
 
-_SHUFFLED = "Put the other two cubes under the cover, and change the places of all three in any order."
+_IN_ORDER = "From the arm's right: {order}."
+_SHUFFLED = f"Put the {{others}} cubes under the cover, too, and change the places of all three. {_IN_ORDER}"
 STAGES = (
     Stage(
         name="CubeVisible",
         twin="visible",
         description="Three cubes lie on the table, and the sentence names the colour of one: pick that one.",
         instruction=PICK,
-        phases=(StagePhase("response", "Put the three cubes on the table.", 0),),
+        phases=(StagePhase("response", f"Put the three cubes on the table. {_IN_ORDER}", 0),),
         paper=_paper(Total=(1.00, 0.80), red=(1.00, 0.90), green=(1.00, 0.90), blue=(1.00, 0.60)),
     ),
     Stage(
@@ -81,8 +84,8 @@ STAGES = (
         description="One cube lies on the table, then two others are thrown in: pick the first.",
         instruction=REMEMBER,
         phases=(
-            StagePhase("cue", "Put the {color} cube on the table, alone.", 20),
-            StagePhase("response", "Throw in the {others} cubes.", 0),
+            StagePhase("cue", "Put the {color} cube on the table, alone: {place}.", 20),
+            StagePhase("response", f"Throw in the {{others}} cubes. {_IN_ORDER}", 0),
         ),
         paper=_paper(Total=(0.63, 0.43), red=(0.70, 0.40), green=(0.70, 0.60), blue=(0.50, 0.30)),
     ),
@@ -95,7 +98,7 @@ STAGES = (
         ),
         instruction=REMEMBER,
         phases=(
-            StagePhase("cue", "Put the {color} cube on the table, alone.", 20),
+            StagePhase("cue", "Put the {color} cube on the table, alone: in the middle.", 20),
             StagePhase("delay", "Cover the {color} cube.", 20),
             StagePhase("delay", _SHUFFLED, 20),
             StagePhase("response", "Take the cover away.", 0),
@@ -104,6 +107,27 @@ STAGES = (
     ),
 )
 """In the paper's order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """One episode as the operator is told of it: what to place, not which policy will move the arm."""
+
+    place: int  # in the plan, from 0: the seed of its record
+    stage: Stage
+    color: int  # index of the right cube
+    places: tuple[int, ...]  # of each cube, from the arm's right: where it lies when the choice is made
+
+    def words(self, phase: StagePhase) -> str:
+        """Return what the operator is asked to do before a phase begins."""
+        color = COLORS[self.color]
+        by_place = sorted(range(len(COLORS)), key=lambda index: self.places[index])
+        return phase.asks.format(
+            color=color,
+            others=" and ".join(name for name in COLORS if name != color),
+            place=PLACES[self.places[self.color]],
+            order=", ".join(COLORS[index] for index in by_place),
+        )
 
 
 def stage_of(task: str) -> Stage:
