@@ -1,7 +1,8 @@
 """The order of the episodes on a real arm: complete blocks, each in random order.
 
 A block has one episode of each stage, colour and policy. So what changes slowly (light, wear, a tired
-operator) meets all of them alike, and an evaluation that ends early is balanced up to its last block.
+operator) meets all of them alike, and an evaluation that ends early is balanced up to its last block. In a
+block all policies meet the same places of the cubes, and have the same seed: they can be compared in pairs.
 """
 
 from collections.abc import Sequence
@@ -9,12 +10,12 @@ from dataclasses import dataclass
 from itertools import product
 
 from vla_eval.seeding import Stream, generator
-from vla_eval.tasks.real_stages import COLORS, Stage, Trial
+from vla_eval.tasks.real_stages import COLORS, STAGES, Stage, Trial
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlannedEpisode:
-    """A trial, and the policy that moves the arm, which the operator is not told."""
+    """A trial, and the policy that moves the arm, which is hidden from the operator."""
 
     trial: Trial
     policy: str
@@ -34,10 +35,11 @@ def make_plan(
     rows = list(product(stages, range(len(COLORS)), policies))
     planned: list[PlannedEpisode] = []
     for block in range(episodes):
-        draws = generator(seed, Stream.REAL_PLAN, block)
-        for index in draws.permutation(len(rows)):
+        for index in generator(seed, Stream.REAL_PLAN, block).permutation(len(rows)):
             stage, color, policy = rows[index]
+            own = block * len(COLORS) + color
+            draws = generator(seed, Stream.REAL_PLAN, block, 1 + STAGES.index(stage), color)
             places = tuple(int(place) for place in draws.permutation(len(COLORS)))
-            trial = Trial(place=len(planned), stage=stage, color=color, places=places)
+            trial = Trial(number=len(planned) + 1, seed=own, stage=stage, color=color, places=places)
             planned.append(PlannedEpisode(trial=trial, policy=policy))
     return tuple(planned)

@@ -5,7 +5,7 @@ stages and no durations: the third has the second's sentence here, and all durat
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 from vla_eval.errors import unknown_name
@@ -50,7 +50,7 @@ class Stage:
     instruction: str
     phases: tuple[StagePhase, ...]
     # the paper's π0.5, fine-tuned for each stage: `Total`, and each colour
-    paper: Mapping[str, Rates]
+    paper: Mapping[str, Rates] = field(hash=False)
 
     @property
     def twin_id(self) -> str:
@@ -111,9 +111,11 @@ STAGES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """One episode as the operator is told of it: what to place, not which policy will move the arm."""
+    """One episode as the operator knows it: what to place, not which policy will move the arm."""
 
-    place: int  # in the plan, from 0: the seed of its record
+    number: int  # in the plan, from 1: for people
+    # of its record: the same in all stages, and for all policies, which meet the same colour and places
+    seed: int
     stage: Stage
     color: int  # index of the right cube
     places: tuple[int, ...]  # of each cube, from the arm's right: where it lies when the choice is made
