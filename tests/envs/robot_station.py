@@ -9,7 +9,6 @@ import numpy as np
 from vla_eval.config.real_robot import RobotSettings
 from vla_eval.envs.robot.link import RobotLink
 from vla_eval.envs.robot.robot_env import RobotEnv, Station
-from vla_eval.envs.robot.units import Units
 from vla_eval.envs.robot.watch import StepClock
 from vla_eval.tasks.real_stages import Trial, stage_of
 
@@ -89,14 +88,7 @@ class Bench:
         self.arm, self.operator, self.clock = FakeArm(), FakeOperator(), StepClock()
         self.link = RobotLink(self.arm)
         self.link.connect()
-        self.station = Station(
-            link=self.link,
-            operator=self.operator,
-            settings=self.settings,
-            clock=self.clock,
-            units=Units.of(self.settings, self.link.motors),
-            home=self.link.read().motors,
-        )
+        self.station = Station.beside(self.link, self.operator, self.settings, self.clock)
         self.trial = Trial(number=1, seed=7, stage=stage_of(stage), color=2, places=(2, 0, 1))
         self.env = RobotEnv(self.station, self.trial.stage, {7: self.trial})
 

@@ -140,6 +140,12 @@ def test_the_arm_goes_home_in_small_steps_before_an_episode() -> None:
     assert np.abs(np.array(bench.arm.motors) - [10.0, -20.0, 50.0]).max() <= 5.0
 
 
+def test_a_home_that_is_named_is_where_episodes_begin() -> None:
+    bench = Bench(home={"lift": 30.0})
+    bench.reset()
+    assert np.abs(np.array(bench.arm.motors) - [10.0, 30.0, 50.0]).max() <= 5.0
+
+
 def test_an_arm_that_does_not_come_home_is_an_error_that_names_the_motor() -> None:
     bench = Bench()
     bench.arm.motors = [60.0, -20.0, 50.0]

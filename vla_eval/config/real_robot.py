@@ -4,7 +4,7 @@ import hashlib
 import os
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.strict.bounds import Bounds, check_bounds, require
@@ -13,7 +13,7 @@ from vla_eval.strict.decoding import decode, load_yaml
 SIMULATED_TYPE = "simulated_so100"
 """LeRobot's type of the simulated arm, and its name on the command line."""
 SIMULATED_HZ = 20.0  # of every task
-MOTORS = "motors"
+MOTORS: Final = "motors"
 """Control mode: LeRobot's own numbers of the motors. Also the state that they are."""
 RealControlMode = Literal["motors", "pd_joint_pos"]
 TYPE = "type"
@@ -40,8 +40,10 @@ class RobotSettings:
     max_step: Annotated[float, Bounds(0.1, 90)] = 10.0
     # motor -> (lowest, highest) position; a motor that is not named: LeRobot's own range alone
     limits: dict[str, tuple[float, ...]] = field(default_factory=dict)
-    # of an arm that has a row here: joint -> its zero; without it, only `motors` is known of the arm
+    # of an arm that has a row here: joint -> its zero; without it, only `motors` is known about the arm
     zeros: dict[str, JointZero] | None = None
+    # motor -> where it is when an episode begins; one that is not named: where it was when the session began
+    home: dict[str, float] = field(default_factory=dict)
     response_seconds: Annotated[float, Bounds(0.1, 3600)] = 30.0  # for the answer; then the episode ends
     # for the operator, for each of his answers; then the episode is an error
     operator_seconds: Annotated[float, Bounds(1, 3600)] = 300.0

@@ -4,10 +4,12 @@ from typing import Any, Literal
 
 import sapien
 
+from vla_eval.seeding import Stream, generator
 from vla_eval.tasks.memory_env import CueSize, Place, poses
 from vla_eval.tasks.objects.bodies import Flags, Indices, Steps, anywhere
 from vla_eval.tasks.objects.items import CUBE_HALF_SIZE_M
 from vla_eval.tasks.objects.limits import Positive
+from vla_eval.tasks.real_stages import COLORS
 from vla_eval.tasks.remember import RememberColorEnv
 from vla_eval.tasks.tensors_out import Info
 
@@ -115,3 +117,14 @@ class RealTwinEnv(RememberColorEnv):
     def cue_size_m(self) -> CueSize:
         """Return the size of a cube."""
         return CueSize(half_width_m=CUBE_HALF_SIZE_M, height_m=2 * CUBE_HALF_SIZE_M)
+
+
+def drawn(seed: int) -> tuple[int, tuple[int, ...]]:
+    """Return the right cube of an episode, and the place of each from the arm's right, without a simulator.
+
+    As `RememberEnv` draws them. The places are 10 cm apart in y: their jitter of 1 cm changes no order.
+    """
+    key = (RealTwinEnv.FAMILY, len(COLORS))
+    target = int(generator(seed, Stream.TARGET, *key).integers(len(COLORS)))
+    order = generator(seed, Stream.PERMUTATION, *key).permutation(len(COLORS))  # places, from the left
+    return target, tuple(len(COLORS) - 1 - int(index) for index in order)

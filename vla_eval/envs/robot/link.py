@@ -27,7 +27,7 @@ logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Reading:
-    """What the robot says of itself now."""
+    """What the robot reports now."""
 
     motors: Motors
     images: Mapping[str, ImageArray]  # camera -> (H, W, 3)

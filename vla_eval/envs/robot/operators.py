@@ -1,6 +1,6 @@
 """What the environment asks of the person beside the arm; and the keys, a row each.
 
-Knows nothing of terminals, robots or policies: an operator is told what to place, not what moves the arm.
+Knows nothing of terminals, robots or policies: an operator knows what to place, not what moves the arm.
 """
 
 from collections.abc import Mapping, Sequence
@@ -32,7 +32,7 @@ MEANINGS: Mapping[str, str] = {key.character: key.means for key in KEYS}
 
 
 class Operator(Protocol):
-    """A person beside the arm, or what plays one."""
+    """A person beside the arm, or a script in their place."""
 
     def prepare(self, trial: Trial) -> None:
         """Have the table set for the first phase of a trial; errors as `ask`."""

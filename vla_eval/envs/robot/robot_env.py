@@ -7,7 +7,7 @@ policy says; an error stops it, and nothing moves before the next reset.
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, Self, runtime_checkable
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from vla_eval.specs import EnvSpec
 from vla_eval.task_state import PrivilegedState, TaskStatus
 from vla_eval.tasks.real_stages import CHANCE, COLORS, Stage, StagePhase, Trial
 
-HOME_TOLERANCE = 5.0  # LeRobot's numbers: so near to where the session began, the arm is at home
+HOME_TOLERANCE = 5.0  # LeRobot's numbers: so near to it, the arm is at home
 SLOT = 0
 
 logger = logging.getLogger(__name__)
@@ -45,7 +45,15 @@ class Station:
     settings: RobotSettings
     clock: Clock
     units: Units
-    home: Motors  # where the arm was when the session began
+    home: Motors  # where the arm is when an episode begins
+
+    @classmethod
+    def beside(cls, link: RobotLink, operator: Operator, settings: RobotSettings, clock: Clock) -> Self:
+        """Return the station of an arm that is connected."""
+        units, here = Units.of(settings, link.motors), link.read().motors
+        pairs = zip(link.motors, here.tolist(), strict=True)
+        home = np.array([settings.home.get(name, position) for name, position in pairs])
+        return cls(link=link, operator=operator, settings=settings, clock=clock, units=units, home=home)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -144,7 +152,7 @@ class RobotEnv:
         try:
             self._station.link.send(now.reading.motors)
         except RobotBusError as exc:  # the first error says more
-            logger.warning("the arm could not be told to hold still: %s", exc)
+            logger.warning("the command to hold still failed, too: %s", exc)
 
     def close(self) -> None:
         """Leave the arm where it is: the session disconnects it."""
@@ -221,7 +229,7 @@ class RobotEnv:
         self._pace.begin()
 
     def _go_home(self) -> None:
-        """Bring the arm to where the session began, a control step's way at a time."""
+        """Bring the arm to where an episode begins, a control step's way at a time."""
         station = self._station
         step = station.settings.max_step
         here = station.link.read().motors

@@ -1,4 +1,4 @@
-"""The operator that a script plays beside the simulated arm: it sees the true state, and presses the keys."""
+"""The scripted operator beside the simulated arm: it reads the true state, and presses the keys."""
 
 from collections.abc import Sequence
 from itertools import accumulate

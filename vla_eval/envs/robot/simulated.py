@@ -27,9 +27,10 @@ from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import PrivilegedState, TaskStatus
 from vla_eval.tasks.interface import CAMERA_NAMES
 from vla_eval.tasks.real_stages import STAGES, Trial
+from vla_eval.tasks.real_twin import drawn
 
 FAULT_STEP = 3  # control steps into the episode
-SEEDS_PER_TRIAL = 1000  # of which one has colour and places of the trial; 1 in 18 has
+SEEDS_PER_TRIAL = 1000  # of which 1 in 18 has colour and places of the trial
 
 
 @RobotConfig.register_subclass(SIMULATED_TYPE)
@@ -94,8 +95,8 @@ class SimulatedSO100(Robot):  # type: ignore[misc]  # lerobot is untyped
         """Nothing is to be done."""
 
     def disconnect(self) -> None:
-        """Disconnect; the simulators stay."""
-        self._is_connected = False
+        """Disconnect; the simulators stay, and the arm is put to rest."""
+        self._is_connected, self._result = False, None
 
     def close(self) -> None:
         """Release the simulators."""
@@ -113,21 +114,20 @@ class SimulatedSO100(Robot):  # type: ignore[misc]  # lerobot is untyped
                 EnvSettings(task=stage, kwargs=kwargs, cameras=cameras, privileged=True)
             )
         self._env = self._envs[stage]
-        first = trial.seed * SEEDS_PER_TRIAL
-        wanted = (trial.color, trial.places)
-        for seed in range(first, first + SEEDS_PER_TRIAL):
-            status = self._env.reset({0: seed}, render=False)[0].status
-            if (status.target, status.candidate_places) == wanted:
-                break
-        else:
-            raise SimulationError(f"{stage}: no episode of {SEEDS_PER_TRIAL} has {wanted}. Please report it.")
+        first, wanted = trial.seed * SEEDS_PER_TRIAL, (trial.color, trial.places)
+        seed = next(seed for seed in range(first, first + SEEDS_PER_TRIAL) if drawn(seed) == wanted)
         self._seed, self._frozen, self.sent = seed, {}, []
         self._result = self._env.reset({0: seed}, render=bool(self.config.views))[0]
+        found = self._result.status
+        if (found.target, found.candidate_places) != wanted:
+            raise SimulationError(
+                f"{stage}, seed {seed}: expected {wanted}, found {found}. Please report it."
+            )
         self._fault = self.faults.pop(trial.number, None) if self._is_connected else None
 
     @property
     def status(self) -> TaskStatus:
-        """What the simulator says of the episode: for the operator that a script plays."""
+        """What the simulator says of the episode: for the scripted operator."""
         return self._last.status
 
     @property

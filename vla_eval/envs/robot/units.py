@@ -48,6 +48,7 @@ class Units:
             RecipeError: a zero is missing, or the robot has no row.
         """
         check_names("motor", settings.limits, motors, where="limits")
+        check_names("motor", settings.home, motors, where="home")
         pairs = [settings.limits.get(name, (-UNLIMITED, UNLIMITED)) for name in motors]
         low, high = (np.array([pair[side] for pair in pairs]) for side in (0, 1))
         if settings.zeros is None:
