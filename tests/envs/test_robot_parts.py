@@ -1,6 +1,5 @@
 """Units, the watchdog's parts, the operator's keys, and what may stand in a robot's file."""
 
-import hashlib
 import os
 import pty
 from pathlib import Path
@@ -80,18 +79,27 @@ def test_a_robots_file_is_read_strictly(text: str, words: str, tmp_path: Path) -
         load_robot(str(path))
 
 
-def test_a_robots_file_gives_its_settings_and_its_digest(tmp_path: Path) -> None:
+def test_a_robots_file_gives_its_settings_and_addresses_are_no_part_of_what_results_depend_on(
+    tmp_path: Path,
+) -> None:
     path = tmp_path / "bench_3.yaml"
-    path.write_text(
-        "lerobot: {type: so101_follower, port: /dev/ttyACM0, id: bench_3}\n"
+    text = (
+        "lerobot: {type: so101_follower, port: /dev/ttyACM0, id: bench_3, "
+        "cameras: {front: {type: opencv, index_or_path: 0, fps: 30}}}\n"
         "control_mode: pd_joint_pos\nlimits: {gripper: [0, 90]}\n"
         "zeros: {shoulder_pan: {sign: -1, zero_deg: 2}}\n"
     )
-    robot = load_robot(str(path))
-    assert (robot.name, robot.settings.type) == ("bench_3", "so101_follower")
-    assert robot.settings.limits == {"gripper": (0.0, 90.0)}
-    assert robot.settings.zeros == {"shoulder_pan": JointZero(sign=-1, zero_deg=2.0)}
-    assert robot.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
+    path.write_text(text)
+    settings = load_robot(str(path))
+    assert settings.type == "so101_follower"
+    assert settings.limits == {"gripper": (0.0, 90.0)}
+    assert settings.zeros == {"shoulder_pan": JointZero(sign=-1, zero_deg=2.0)}
+
+    path.write_text(text.replace("ACM0", "ACM1").replace("index_or_path: 0", "index_or_path: 2"))
+    elsewhere = load_robot(str(path))
+    assert elsewhere.lerobot["port"] == "/dev/ttyACM1" and elsewhere.content == settings.content
+    path.write_text(text.replace("id: bench_3", "id: bench_4"))
+    assert load_robot(str(path)).content != settings.content
 
 
 def test_a_mistyped_robot_gets_a_suggestion() -> None:
@@ -174,6 +182,15 @@ def test_what_was_typed_before_a_question_is_no_answer_to_it() -> None:
         terminal.answers = ["x"]
         with pytest.raises(OperatorError, match="said no"):
             operator.until_held()
+
+
+def test_ctrl_c_ends_a_question() -> None:
+    terminal = Terminal()
+    operator = KeysOperator(
+        SIMULATED, terminal.clock, descriptor=terminal.descriptor, say=terminal.say, stops=lambda: True
+    )
+    with pytest.raises(KeyboardInterrupt), operator:
+        operator.ask("May it move?")
 
 
 def test_keys_need_a_terminal() -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from vla_eval.config.real_robot import SIMULATED, NamedRobot
+from vla_eval.config.real_robot import SIMULATED
 from vla_eval.envs.robot.faults import FAULTS
 from vla_eval.envs.robot.link import RobotLink
 from vla_eval.envs.robot.opening import open_robot
@@ -52,14 +52,14 @@ def arms() -> Any:
 
 def evaluation(out: Path, *policies: str, **fields: Any) -> RealEvaluation:
     own = {"stages": (stage_of("CubesThrownIn"),), "episodes": 1, "seed": 0, "n_action_steps": 1}
-    robot = NamedRobot(name="simulated_so100", settings=fields.pop("settings", BLIND), sha256=None)
+    robot = fields.pop("settings", BLIND)
     return RealEvaluation(
         robot=robot, policies=load_policy_entries(policies or ("oracle",)), named_out=out, **{**own, **fields}
     )
 
 
 def session(arm: Any, asked: RealEvaluation, **fields: Any) -> Session:
-    link, settings = RobotLink(arm), asked.robot.settings
+    link, settings = RobotLink(arm), asked.robot
     link.connect()
     station = Station.beside(link, fields.pop("operator", ScriptedOperator(arm)), settings, StepClock())
     return Session(evaluation=asked, station=station, say=lambda _: None, **fields)

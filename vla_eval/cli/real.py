@@ -7,7 +7,7 @@ from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, MANY, add_flags, typed_command
-from vla_eval.config.real_robot import NamedRobot, RobotSettings, load_robot
+from vla_eval.config.real_robot import RobotSettings, load_robot
 from vla_eval.errors import RecipeError, check_names
 from vla_eval.tasks.real_stages import EPISODES_PER_COLOR, STAGES, stage_of
 
@@ -120,8 +120,8 @@ def _evaluation(args: argparse.Namespace) -> "RealEvaluation":
                 "simulated_so100 --policy oracle"
             )
     robot = load_robot(args.robot)
-    operator = args.operator or (SCRIPTED if robot.settings.is_simulated else KEYS)
-    if (operator == SCRIPTED) != robot.settings.is_simulated:
+    operator = args.operator or (SCRIPTED if robot.is_simulated else KEYS)
+    if (operator == SCRIPTED) != robot.is_simulated:
         raise RecipeError(
             f"--operator {operator}: a script sets the table of the simulated arm (--robot simulated_so100), "
             "and a person that of a real one. Leave --operator out."
@@ -141,9 +141,9 @@ def _evaluation(args: argparse.Namespace) -> "RealEvaluation":
     )
 
 
-def _faults(texts: list[str], robot: NamedRobot, *, n_episodes: int) -> dict[int, str]:
+def _faults(texts: list[str], robot: RobotSettings, *, n_episodes: int) -> dict[int, str]:
     """Return number of an episode -> fault."""
-    if texts and not robot.settings.is_simulated:
+    if texts and not robot.is_simulated:
         raise RecipeError("--rehearse: expected --robot simulated_so100: a real arm has faults of its own.")
     found = {}
     for text in texts:
@@ -169,7 +169,7 @@ def _session(
     from vla_eval.config.evaluation import CaptureConfig
     from vla_eval.real.session import Session
 
-    with _connected(evaluation.robot, faults) as station:
+    with _connected(evaluation.robot, faults, stops) as station:
         session = Session(
             evaluation=evaluation,
             station=station,
@@ -187,7 +187,9 @@ def _session(
 
 
 @contextmanager
-def _connected(robot: NamedRobot, faults: dict[int, str]) -> "Iterator[Station]":
+def _connected(
+    settings: RobotSettings, faults: dict[int, str], stops: Callable[[], bool]
+) -> "Iterator[Station]":
     """Connect the arm, and have somebody beside it."""
     from vla_eval.envs.robot.link import RobotLink
     from vla_eval.envs.robot.opening import open_robot
@@ -195,20 +197,24 @@ def _connected(robot: NamedRobot, faults: dict[int, str]) -> "Iterator[Station]"
     from vla_eval.envs.robot.units import Units
     from vla_eval.envs.robot.watch import StepClock, WallClock
 
-    settings = robot.settings
     with ExitStack() as ending:
         device = open_robot(settings)
         link = RobotLink(device)
         Units.of(settings, link.motors)  # refuses limits of motors that are not there, before it connects
         clock = StepClock() if settings.is_simulated else WallClock()
-        operator = _operator(settings, device, faults, clock, ending)
+        operator = _operator(settings, device, faults, clock, stops, ending)
         ending.callback(link.disconnect)
         link.connect()
         yield Station.beside(link, operator, settings, clock)
 
 
 def _operator(
-    settings: RobotSettings, device: Any, faults: dict[int, str], clock: Any, ending: ExitStack
+    settings: RobotSettings,
+    device: Any,
+    faults: dict[int, str],
+    clock: Any,
+    stops: Callable[[], bool],
+    ending: ExitStack,
 ) -> "Operator":  # Any: a robot of lerobot's, and a clock
     if settings.is_simulated:
         from vla_eval.envs.robot.scripted import ScriptedOperator
@@ -218,7 +224,8 @@ def _operator(
         return ScriptedOperator(device)
     from vla_eval.envs.robot.keys import KeysOperator
 
-    return ending.enter_context(KeysOperator(settings, clock, descriptor=sys.stdin.fileno(), say=_say))
+    terminal = sys.stdin.fileno()
+    return ending.enter_context(KeysOperator(settings, clock, descriptor=terminal, say=_say, stops=stops))
 
 
 def _fault_names() -> tuple[str, ...]:

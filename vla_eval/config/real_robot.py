@@ -1,11 +1,12 @@
 """A robot arm for `mikasa-vla real`: LeRobot's fields of it, and the limits within which it may move."""
 
-import hashlib
 import os
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
+from vla_eval.config.files import to_data
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.strict.bounds import Bounds, check_bounds, require
 from vla_eval.strict.decoding import decode, load_yaml
@@ -17,6 +18,8 @@ MOTORS: Final = "motors"
 """Control mode: LeRobot's own numbers of the motors. Also the state that they are."""
 RealControlMode = Literal["motors", "pd_joint_pos"]
 TYPE = "type"
+ADDRESSES = ("port", "index_or_path", "serial_number_or_name")
+"""LeRobot's fields that say where a device is found today."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,6 +83,19 @@ class RobotSettings:
         """Whether it is the simulated arm."""
         return self.type == SIMULATED_TYPE
 
+    @property
+    def content(self) -> dict[str, Any]:  # Any: plain data
+        """All that results depend on: everything but where devices are found."""
+        return {**to_data(self), "lerobot": _without_addresses(self.lerobot)}
+
+
+def _without_addresses(fields: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data
+    return {
+        name: _without_addresses(value) if isinstance(value, Mapping) else value
+        for name, value in fields.items()
+        if name not in ADDRESSES
+    }
+
 
 SIMULATED = RobotSettings(
     lerobot={TYPE: SIMULATED_TYPE},
@@ -96,16 +112,7 @@ SIMULATED = RobotSettings(
 """The simulated arm: its motors' degrees are the angles of its model."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class NamedRobot:
-    """Settings, what they are called, and the sha256 of their file; None for the simulated arm."""
-
-    name: str
-    settings: RobotSettings
-    sha256: str | None
-
-
-def load_robot(name: str) -> NamedRobot:
+def load_robot(name: str) -> RobotSettings:
     """Return the simulated arm by its name, or what a YAML file says.
 
     Raises:
@@ -113,16 +120,14 @@ def load_robot(name: str) -> NamedRobot:
         RecipeError: it cannot be read, or a value is not allowed.
     """
     if name == SIMULATED_TYPE:
-        return NamedRobot(name=name, settings=SIMULATED, sha256=None)
+        return SIMULATED
     path = Path(name)
     if path.suffix not in (".yaml", ".yml") or not os.path.isfile(path):
         raise unknown_name("robot", name, [SIMULATED_TYPE, "FILE.yaml (docs/real_robot.md)"], where="--robot")
     try:
-        content = path.read_bytes()
-        data = load_yaml(content.decode("utf-8"), where=name)
+        data = load_yaml(path.read_text(encoding="utf-8"), where=name)
     except (OSError, UnicodeDecodeError) as exc:
         raise RecipeError(f"{name}: cannot be read as a text file in UTF-8 ({exc}).") from exc
     if not isinstance(data, dict):
         raise RecipeError(f"{name}: expected fields with values (`lerobot: …`), found {data!r:.60}.")
-    settings = decode(RobotSettings, data, where=name)
-    return NamedRobot(name=path.stem, settings=settings, sha256=hashlib.sha256(content).hexdigest())
+    return decode(RobotSettings, data, where=name)

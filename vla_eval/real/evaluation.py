@@ -8,8 +8,8 @@ from typing import Any  # plain data
 
 from vla_eval.checkpoints.notes import checkpoint_hashes
 from vla_eval.chunking import ChunkingSettings
-from vla_eval.config.files import digest_of, to_data
-from vla_eval.config.real_robot import NamedRobot
+from vla_eval.config.files import digest_of
+from vla_eval.config.real_robot import RobotSettings
 from vla_eval.errors import RecipeError, SpecMismatchError
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.recipe import bare_policy
@@ -31,7 +31,7 @@ RANDOM = "random"  # adapter
 class RealEvaluation:
     """An evaluation on an arm, as it will run."""
 
-    robot: NamedRobot
+    robot: RobotSettings
     policies: tuple[PolicyEntry, ...]
     stages: tuple[Stage, ...]
     episodes: int  # per stage, colour and policy
@@ -52,12 +52,12 @@ class RealEvaluation:
                     f"policies: {entry.name}: expected one checkpoint, found {len(entry.recipes)}. On an arm "
                     "each is a policy of its own: give them different names."
                 )
-            if entry.value.adapter == RANDOM and not self.robot.settings.is_simulated:
+            if entry.value.adapter == RANDOM and not self.robot.is_simulated:
                 raise SpecMismatchError(
                     f"policy '{entry.name}' moves at random, which no real arm should. Rehearse it with "
                     "--robot simulated_so100."
                 )
-            if entry.value.adapter in PRIVILEGED and not self.robot.settings.is_simulated:
+            if entry.value.adapter in PRIVILEGED and not self.robot.is_simulated:
                 raise SpecMismatchError(
                     f"policy '{entry.name}' reads the true state of the world, which a real arm does not "
                     "tell. Rehearse it with --robot simulated_so100."
@@ -96,7 +96,7 @@ class RealEvaluation:
 
     def task(self, stage: Stage) -> str:
         """Return what records call a stage: its twin's id on the simulated arm."""
-        return stage.twin_id if self.robot.settings.is_simulated else stage.real_id
+        return stage.twin_id if self.robot.is_simulated else stage.real_id
 
     def key(self, planned: PlannedEpisode) -> EpisodeKey:
         """Return the identity of an episode."""
@@ -127,12 +127,12 @@ class RealEvaluation:
             "runs": 1,
             "seed_start": 0,
             "stop_at_success": True,
-            "env": {"robot": self.robot.settings.type},
+            "env": {"robot": self.robot.type},
             "real": {
                 "plan_seed": self.seed,
                 "policies": list(self.names),
                 "stages": [stage.name for stage in self.stages],
-                "robot": to_data(self.robot.settings),
+                "robot": self.robot.content,
             },
         }
 

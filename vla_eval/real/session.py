@@ -128,7 +128,9 @@ class Session:
             OperatorError: the operator does not want to continue.
         """
         evaluation = self.evaluation
-        description = evaluation.describe(command=command, options={"capture": self.capture.video})
+        description = evaluation.describe(
+            command=command, options={"capture": self.capture.video, "lerobot": evaluation.robot.lerobot}
+        )
         groups = {evaluation.key(planned)[:3] for planned in evaluation.plan}
         n_errors = n_in_row = 0
         with RunFolder.open(

@@ -26,12 +26,19 @@ class KeysOperator:
     """A person at the terminal `descriptor`; a context manager that gives the terminal back as it was."""
 
     def __init__(
-        self, settings: RobotSettings, clock: Clock, *, descriptor: int, say: Callable[[str], None]
+        self,
+        settings: RobotSettings,
+        clock: Clock,
+        *,
+        descriptor: int,
+        say: Callable[[str], None],
+        stops: Callable[[], bool] = lambda: False,
     ) -> None:
-        """Begin with the dead man's key not held; `say` shows a line."""
+        """Begin with the dead man's key not held; `say` shows a line, `stops`: whether Ctrl-C was pressed."""
         self._settings, self._clock = settings, clock
         self._descriptor = descriptor
         self._say = say
+        self._stops = stops
         self._alive: float | None = None  # time of the last character
         self._pressed: list[str] = []
         self._before: list[Any] | None = None  # Any: termios' attributes
@@ -94,6 +101,8 @@ class KeysOperator:
     def _wait(self, is_done: Callable[[], bool], words: str) -> None:
         until = self._clock.now() + self._settings.operator_seconds
         while True:
+            if self._stops():
+                raise KeyboardInterrupt
             done = is_done()  # which may read
             if ABORT in self._pressed:
                 self._pressed = []

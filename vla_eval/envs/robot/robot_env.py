@@ -170,7 +170,9 @@ class RobotEnv:
         station = self._station
         self._take_keys(now)
         goal = now.held
-        if self._answers(now) and not now.is_over:
+        if not self._moves(now):
+            self._pace.begin()  # a gap between two commands to stay harms nobody
+        else:
             if not station.operator.lets_move():
                 raise OperatorError(
                     f"the dead man's key was let go at control step {now.n_steps}: the arm holds still, "
@@ -206,8 +208,13 @@ class RobotEnv:
                 f"{now.trial.words(self._stage.phases[now.phase + 1])}"
             )
 
+    def _moves(self, now: _Running) -> bool:
+        """Whether the arm may move: from the first observation on that was made in the last phase."""
+        is_new = now.phase > 0 and now.n_steps == now.phase_step
+        return self._answers(now) and not is_new and not now.is_over
+
     def _answers(self, now: _Running) -> bool:
-        """Whether it is the last phase, in which the arm may move."""
+        """Whether it is the last phase."""
         return now.phase == len(self._stage.phases) - 1
 
     def _mark(self, now: _Running, key: str) -> None:
