@@ -115,7 +115,8 @@ class RobotLink:
         try:
             yield
         except Exception as exc:  # LeRobot's drivers raise what their libraries raise
+            said = " ".join(str(exc).split())
             raise RobotBusError(
-                f"robot '{self.robot.name}', {doing}: {type(exc).__name__}: {exc} Check cables and power; "
-                "the episode is run again."
+                f"robot '{self.robot.name}', {doing}: {type(exc).__name__}: {said} Check cables and power, "
+                "then run the command again."
             ) from exc
