@@ -152,6 +152,15 @@ def test_the_arm_goes_home_in_small_steps_before_an_episode() -> None:
     assert np.abs(np.array(bench.arm.motors) - [10.0, -20.0, 50.0]).max() <= 5.0
 
 
+def test_the_table_is_set_when_the_arm_is_at_home() -> None:
+    bench = Bench()
+    bench.arm.motors = [60.0, -20.0, 0.0]
+    places: list[list[float]] = []
+    bench.operator.prepare = lambda trial: places.append(list(bench.arm.motors))  # type: ignore[method-assign]
+    bench.reset()
+    assert np.abs(np.array(places[0]) - [10.0, -20.0, 50.0]).max() <= 5.0
+
+
 def test_a_home_that_is_named_is_where_episodes_begin() -> None:
     bench = Bench(home={"lift": 30.0})
     bench.reset()

@@ -107,6 +107,7 @@ class Watching(ScriptedOperator):
 
     def ask(self, words: str) -> None:
         self.n_sent[words.partition(" during")[0]] = len(self.arm.sent)
+        super().ask(words)
 
 
 @pytest.mark.parametrize("fault", ["power", pytest.param("key", marks=pytest.mark.slow)])

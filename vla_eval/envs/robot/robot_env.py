@@ -23,6 +23,7 @@ from vla_eval.task_state import PrivilegedState, TaskStatus
 from vla_eval.tasks.real_stages import CHANCE, COLORS, Stage, StagePhase, Trial
 
 HOME_TOLERANCE = 5.0  # LeRobot's numbers: so near to it, the arm is at home
+STALL_SECONDS = 1.0  # without coming nearer, on the way home: something holds the arm
 SLOT = 0
 
 logger = logging.getLogger(__name__)
@@ -98,14 +99,14 @@ class RobotEnv:
         )
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
-        """Have the table set for a trial, and bring the arm home; see `SimEnv.reset`."""
+        """Bring the arm home, then have the table set for a trial; see `SimEnv.reset`."""
         trial = self._trials[seeds[SLOT]]
         self._now = None
-        self._station.operator.prepare(trial)
         self._watch = CameraWatch(stale_frames=self._station.settings.stale_frames)
         self._pace.begin()
+        self._go_home()
+        self._station.operator.prepare(trial)
         try:
-            self._go_home()
             reading = self._station.link.read()
             self._now = _Running(trial=trial, reading=reading, before=reading.motors, held=reading.motors)
             self._announce()
@@ -238,22 +239,25 @@ class RobotEnv:
     def _go_home(self) -> None:
         """Bring the arm to where an episode begins, a control step's way at a time."""
         station = self._station
-        step = station.settings.max_step
-        here = station.link.read().motors
+        step, here = station.settings.max_step, station.link.read().motors
+        least, n_stalled = np.inf, 0
         if np.abs(station.home - here).max() > HOME_TOLERANCE:
             station.operator.until_held()
-        n_most = 2 + int(4 * np.abs(station.home - here).max() / step)
-        for _ in range(n_most):
-            if np.abs(station.home - here).max() <= HOME_TOLERANCE:
-                return
+        while np.abs(station.home - here).max() > HOME_TOLERANCE:
+            off = float(np.abs(station.home - here).sum())
+            least, n_stalled = min(least, off), 0 if off < least else n_stalled + 1
+            if n_stalled > STALL_SECONDS * station.settings.control_hz:
+                left = np.round(station.home - here, 1).tolist()
+                raise RobotBusError(
+                    f"the arm did not come home: {dict(zip(station.link.motors, left, strict=True))} are "
+                    "left. Free it, and check its torque."
+                )
             if not station.operator.lets_move():
                 raise OperatorError("the dead man's key was let go while the arm moved home.")
             station.link.send(np.clip(station.home, here - step, here + step))
             self._pace.check()
             self._pace.wait()
             here = station.link.read().motors
-        off = dict(zip(station.link.motors, np.round(station.home - here, 1).tolist(), strict=True))
-        raise RobotBusError(f"the arm did not come home: {off} are left. Free it, and check its torque.")
 
     def _result(
         self, executed: FloatArray | None = None, wording: Mapping[str, str] | None = None

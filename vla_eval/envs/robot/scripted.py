@@ -24,7 +24,8 @@ class ScriptedOperator:
         self._marked = set()
 
     def ask(self, words: str) -> None:
-        """Confirm."""
+        """Confirm: the operator is back."""
+        self._robot.end_fault("key", "away")
 
     def tell(self, words: str) -> None:
         """Hear."""

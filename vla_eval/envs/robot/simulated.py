@@ -145,6 +145,11 @@ class SimulatedSO100(Robot):  # type: ignore[misc]  # lerobot is untyped
         """Whether one of these faults is there now."""
         return self._fault in kinds and self.n_steps >= FAULT_STEP
 
+    def end_fault(self, *kinds: str) -> None:
+        """End one of these faults, if it is there."""
+        if self._fault in kinds:
+            self._fault = None
+
     def get_observation(self) -> dict[str, Any]:
         """Return positions and images."""
         self._refuse()
