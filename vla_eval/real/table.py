@@ -46,11 +46,13 @@ def is_touched(record: EpisodeRecord) -> bool:
 
 def stage_rows(records: Sequence[EpisodeRecord]) -> list[StageRow]:
     """Return a row per stage and policy that has an episode; errors are counted, and are in no rate."""
-    rows = []
+    rows, policies = [], sorted({one.policy for one in records})
     for stage in STAGES:
         on_stage = [one for one in records if stage_of(one.task) == stage]
-        for policy in dict.fromkeys(one.policy for one in on_stage):
+        for policy in policies:
             own = [one for one in on_stage if one.policy == policy]
+            if not own:
+                continue
             results = [one for one in own if one.outcome != "error"]
             rows.append(
                 StageRow(
