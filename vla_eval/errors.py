@@ -131,6 +131,26 @@ class RemoteChangedError(RemotePolicyError):
     """A server is not what it was when the run was planned."""
 
 
+class RobotError(VlaEvalError):
+    """Root of what goes wrong with a robot arm: the episode has no result, and nothing moves afterwards."""
+
+
+class RobotBusError(RobotError):
+    """The motors cannot be read or commanded: a cable, the power, a servo."""
+
+
+class RobotCameraError(RobotError):
+    """A camera is gone, or gives the same image again and again."""
+
+
+class RobotTimingError(RobotError):
+    """The arm was without a command for too long: a slow policy, or a machine that stood still."""
+
+
+class OperatorError(RobotError):
+    """The operator stopped the episode, let go of the dead man's key, or does not answer."""
+
+
 class LockedError(VlaEvalError, PermissionError):
     """Something was refused by the lock of this process, see `vla_eval.lock`."""
 

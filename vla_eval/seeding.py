@@ -33,6 +33,7 @@ class Stream(IntEnum):
     DELAY = 12
     MEMORY = 13
     CLUTTER = 14
+    REAL_PLAN = 15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

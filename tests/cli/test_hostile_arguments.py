@@ -13,6 +13,7 @@ import vla_eval.bench.official
 import vla_eval.bench.rendering
 import vla_eval.bench.serving
 import vla_eval.doctor
+import vla_eval.envs.robot.opening
 import vla_eval.serving.server
 import vla_eval.training.finetune
 import vla_eval.workers.pool
@@ -33,6 +34,7 @@ NEEDED: dict[tuple[str, ...], str] = {
     ("check",): "oracle",
     ("audit",): f"--task {TASK} --set simulator=fake",
     ("probe",): f"--task {TASK} --policy oracle --set simulator=fake",
+    ("real",): "--robot simulated_so100 --policy random",
     ("view",): "recorded",
     ("record",): f"--task {TASK} --set simulator=fake",
     ("replay",): "recorded",
@@ -72,6 +74,7 @@ def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(vla_eval.workers.pool.WorkerPool, "__init__", refuse)
     for module, name in (
+        (vla_eval.envs.robot.opening, "open_robot"),
         (vla_eval.serving.server, "run_server"),
         (vla_eval.training.finetune, "finetune"),
         (vla_eval.bench.loader, "run_loader_bench"),

@@ -84,6 +84,17 @@ MISTAKES: dict[str, dict[str, str]] = {
         f"probe --task {TASK} --policy act {FAKE}": "has no weights",
         **{f"probe --task {TASK} --policy oracle {env}": said for env, said in WRONG_ENV.items()},
     },
+    "real": {
+        "real --robot simulated_so10 --policy oracle": "Did you mean 'simulated_so100'",
+        "real --robot nowhere.yaml --policy oracle": "nowhere.yaml",
+        "real --robot simulated_so100": "--policy is missing",
+        "real --policy oracle": "--robot is missing",
+        "real --robot simulated_so100 --policy orcale": "Did you mean 'oracle'",
+        "real --robot simulated_so100 --policy oracle --stage CubeShuffled": "Did you mean 'CubesShuffled'",
+        "real --robot simulated_so100 --policy oracle --operator keys": "Leave --operator out",
+        "real --robot simulated_so100 --policy oracle --rehearse cabel@1": "Did you mean 'cable'",
+        "real --robot simulated_so100 --policy oracle --rehearse cable@91": "from 1 to 90",
+    },
     "view": {"view runs/nowhere --print": "runs/nowhere", "view empty --print": "empty"},
     "record": {
         "record nowhere": "nowhere",

@@ -7,7 +7,6 @@ from typing import NamedTuple
 from vla_eval.checkpoints.files import TrainingFacts
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.errors import SpecMismatchError, some_of
-from vla_eval.features import StateKind
 from vla_eval.models.shared.sentence_reading import quoted
 from vla_eval.robots.find import ROBOT
 from vla_eval.specs import EnvSpec
@@ -24,7 +23,7 @@ class Asked(NamedTuple):
     env: EnvSpec  # what the environment offers
     # image fields in the policy's order -> (height_px, width_px)
     images: Mapping[str, tuple[int, int]] | None = None
-    state: StateKind | None = None  # which proprioception it is given
+    state: str | None = None  # which proprioception, or other numbers, it is given
 
 
 class Compared(NamedTuple):

@@ -29,6 +29,7 @@ VERBS: Mapping[str, str] = {
     "check": "check whether a policy, or a policy server, keeps its contract",
     "audit": "find the tasks that can be won without memory",
     "probe": "find out what a policy remembers, and for how long",
+    "real": "run the paper's three stages on a robot arm, or on a simulated one",
     "view": "open captured episodes, or a dataset's, in the rerun viewer",
     "record": "record demonstrations as LeRobot datasets, or resume recording",
     "replay": "check a dataset by running its episodes again",

@@ -19,6 +19,7 @@ OWN, OFFICIAL = "vla_eval.envs.maniskill:ManiSkillEnv", "vla_eval.envs.official:
 ENVIRONMENTS: Mapping[Suite, str] = {
     "paper": OWN,
     "objects": OWN,
+    "real_twin": OWN,
     "mikasa_vla_90": OFFICIAL,
     "mikasa_official": OFFICIAL,
     "mikasa_base": "vla_eval.envs.mikasa_base:BaseTaskSim",

@@ -155,6 +155,7 @@ class ManiSkillEnv:
                 status=env.status(info, row),
                 reward=float(rewards[row]),
                 executed_action=None if is_reset else env.executed_action[row].copy(),
+                wording=env.wording(row) if is_reset else {},
             )
         return results
 

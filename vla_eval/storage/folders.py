@@ -13,7 +13,8 @@ EPISODES_FILE = "episodes.jsonl"
 TIMINGS_FILE = "timings.jsonl"
 LOCK_FILE = "run.lock"
 LOGS = "logs"
-SUBFOLDERS = (LOGS, *dict.fromkeys(one.folder for one in EPISODE_FILES))
+MARKS = "marks"  # images of an evaluation on a real arm
+SUBFOLDERS = (LOGS, MARKS, *dict.fromkeys(one.folder for one in EPISODE_FILES))
 # What a process that was killed before it wrote run.json may have left behind.
 UNSTARTED = frozenset({LOCK_FILE, f"{RUN_FILE}.tmp"})
 

@@ -20,6 +20,7 @@ from vla_eval.tasks.catalogs.official_catalog import (
     NAMESPACE_ORIGINAL,
     original_tasks,
 )
+from vla_eval.tasks.catalogs.real_twin_catalog import REAL_TWIN
 from vla_eval.tasks.catalogs.sequence_catalog import SEQUENCE_TASKS
 from vla_eval.tasks.catalogs.spatial_catalog import SPATIAL_TASKS
 from vla_eval.tasks.families import FAMILY_TABLE, make_families
@@ -137,7 +138,7 @@ FAMILIES = make_families(TASKS)
 OFFICIAL_TASKS: dict[str, TaskSpec] = {**MIKASA_VLA_90, **original_tasks(TASKS.values())}
 """The tasks of the official package, which run only where it is installed."""
 
-_ELSEWHERE = {**OFFICIAL_TASKS, **MIKASA_BASE}
+_ELSEWHERE = {**OFFICIAL_TASKS, **MIKASA_BASE, **REAL_TWIN}
 
 SUITES: dict[Suite, dict[str, TaskSpec]] = {
     suite: {spec.id: spec for spec in (*TASKS.values(), *_ELSEWHERE.values()) if spec.suite == suite}

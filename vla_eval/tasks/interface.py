@@ -18,9 +18,8 @@ from vla_eval.strict.bounds import MAX_STEPS
 IMAGE_SIZE = "image_size"
 """Name of the argument in `env`: height and width of the images of both cameras, in pixels."""
 CAMERA_FOV_RAD = np.pi / 2
-# Where the base camera is and what it points at, world frame: up is up in its image.
-BASE_CAMERA_EYE_M = (0.3, 0.0, 0.6)
-BASE_CAMERA_TARGET_M = (-0.1, 0.0, 0.1)
+BASE_CAMERA_M = ((0.3, 0.0, 0.6), (-0.1, 0.0, 0.1))
+"""Where the base camera is and what it points at, world frame: up is up in its image."""
 CAMERA_NAMES = ("base_camera", "hand_camera")
 CONTROL_HZ = 20.0
 ACTION = action_spec(EE_DELTA_POSE)

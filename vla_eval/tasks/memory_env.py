@@ -31,13 +31,7 @@ from vla_eval.robots.find import robot_with_uid
 from vla_eval.seeding import Stream, generator
 from vla_eval.task_state import PHASES, PrivilegedState, TaskStatus
 from vla_eval.tasks.arm.robots import ParsedArms, kept_loader
-from vla_eval.tasks.interface import (
-    BASE_CAMERA_EYE_M,
-    BASE_CAMERA_TARGET_M,
-    CAMERA_FOV_RAD,
-    StepRange,
-    step_range,
-)
+from vla_eval.tasks.interface import BASE_CAMERA_M, CAMERA_FOV_RAD, StepRange, step_range
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Body, Flags, Indices, Steps, anywhere, place, velocity_of
 from vla_eval.tasks.objects.clutter import Clutter
@@ -186,7 +180,7 @@ class MemoryTableEnv(TensorsOut):
 
     @property
     def _default_sensor_configs(self) -> list[CameraConfig]:
-        pose = _look_at(BASE_CAMERA_EYE_M, BASE_CAMERA_TARGET_M)
+        pose = _look_at(*BASE_CAMERA_M)
         return [CameraConfig("base_camera", pose, IMAGE_SIZE_PX, IMAGE_SIZE_PX, CAMERA_FOV_RAD, 0.01, 100)]
 
     @property
@@ -347,6 +341,10 @@ class MemoryTableEnv(TensorsOut):
 
     def moving_bodies(self) -> dict[str, Body]:
         """Return name -> body of the objects that an expert may see in addition to candidates."""
+        return {}
+
+    def wording(self, env: int) -> dict[str, str]:
+        """Return what stands for the words in braces of the instruction in one environment's episode."""
         return {}
 
     def cue_places_m(self, env: int) -> list[Place]:

@@ -22,9 +22,10 @@ MemoryType = Literal[
 """The paper's four types of memory (section on task classification), then six that only the official 90 tasks
 have."""
 
-Suite = Literal["paper", "objects", "mikasa_vla_90", "mikasa_official", "mikasa_base"]
+Suite = Literal["paper", "objects", "mikasa_vla_90", "mikasa_official", "mikasa_base", "real_twin"]
 """Own tasks of the paper's table, and those that other packages add; own tasks with everyday things, which
-the paper shows; the official package's 90; its original ones; MIKASA-Base."""
+the paper shows; the official package's 90; its original ones; MIKASA-Base; the stages on a real arm,
+simulated."""
 
 Split = Literal["short", "medium", "long"]
 LONGEST_SHORT_STEPS, LONGEST_MEDIUM_STEPS = 200, 600  # of the official splits

@@ -258,6 +258,7 @@ class _Recorder:
     def _join(self, task: TaskPlan, selection: Selection, shards: Sequence[ShardJob]) -> None:
         self._begin(task, "joining", n_done=0)
         path = self.folder.out / task.task
+        path.parent.mkdir(exist_ok=True)  # the id may have a namespace
         job = join_job(task, path, shards=shards, failed=selection.failed, run_file=self.folder.run_file)
         for _ in self._answers(JobList([job])):
             self.observer.on_progress(n_done=task.recipe.episodes)

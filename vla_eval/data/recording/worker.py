@@ -126,13 +126,14 @@ def join_dataset(job: JoinJob) -> DatasetFacts:
 
 
 def recorded_episode(plan: TaskPlan, one: Attempt, log: EpisodeLog, *, index: int) -> RecordedEpisode:
-    """Return the manifest's entry of an attempt that has been rendered."""
+    """Return the manifest's entry of an attempt that has been rendered, with the words of its episode."""
+    start = plan.start(one.seed, horizon_steps=one.n_steps).worded(log.results[0].wording)
     return RecordedEpisode(
         episode_index=index,
         task=plan.task,
         task_version=plan.task_version,
         env_kwargs=dict(plan.group.env.kwargs),
-        instruction=plan.group.instruction,
+        instruction=start.instruction,
         expert=plan.group.key.policy,
         expert_version=plan.expert_version,
         **dataclasses.asdict(one),

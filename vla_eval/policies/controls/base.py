@@ -152,12 +152,18 @@ def in_any_control_mode(
         mode = context.env.action.control_mode
         if mode == EE_DELTA_POSE:
             return make(context)
+        arm = arm_of(context)
+        if mode not in arm.actions:
+            raise SpecMismatchError(
+                f"policy '{context.name}' plans with the model of {arm.name}: expected a control mode of its "
+                f"joints ({', '.join(arm.actions)}), found {mode}. Choose one of these."
+            )
         planner = make(replace(context, env=replace(context.env, action=action_spec(EE_DELTA_POSE))))
         if mode == EE_DELTA_POS and planner.privileged and task_spec(context.env.task).turns_wrist:
             raise SpecMismatchError(
                 f"policy '{context.name}': the expert of {context.env.task} turns the wrist, and the control "
                 f"mode {mode} has no rotation. Choose another env.control_mode, or leave this task out."
             )
-        return TranslatedPolicy(planner, arm_of(context), mode)
+        return TranslatedPolicy(planner, arm, mode)
 
     return made

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any  # lerobot is untyped
+from typing import Any, Literal  # lerobot is untyped
 
 import numpy as np
 import torch
@@ -11,15 +11,18 @@ from torch import Tensor
 from vla_eval.checkpoints.files import TrainingFacts
 from vla_eval.checkpoints.loading import LoadedPolicy
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
+from vla_eval.config.real_robot import MOTORS
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
-from vla_eval.features import STATE_KEY, StateKind, proprioception, state_names
+from vla_eval.features import PROPRIO_STATES, STATE_KEY, StateKind, proprioception, state_names
 from vla_eval.robots.arm import Arm
 from vla_eval.robots.find import robot_of_spec
 from vla_eval.robots.rows import PANDA
-from vla_eval.specs import EnvSpec
+from vla_eval.specs import CameraSpec, EnvSpec
 
+GivenState = StateKind | Literal["motors"]
+"""Which numbers `observation.state` is: a kind of proprioception, or a robot's motors as LeRobot has them."""
 MAX_UNIT = 1.0 + 1e-3  # statistics of images in [0, 1]; those of 0 … 255 are far beyond
 MAX_FOV_DIFFERENCE_RAD = 1e-4
 
@@ -30,8 +33,15 @@ class InputMap:
 
     # camera of the environment -> field, as the dataset named it, in the policy's order
     cameras: Mapping[str, str]
-    state: StateKind | None  # which proprioception `observation.state` is; None for a policy without any
+    state: GivenState | None  # None for a policy without any
     arm: Arm = PANDA  # whose it is
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """The states of the environment that it is computed from."""
+        if self.state is None:
+            return ()
+        return (MOTORS,) if self.state == MOTORS else PROPRIO_STATES
 
     def tensors(self, observation: Observation) -> dict[str, Tensor]:
         """Return images (3, H, W) float32 in [0, 1] and state (D,) float32, by field."""
@@ -40,9 +50,12 @@ class InputMap:
             for camera, key in self.cameras.items()
         }
         if self.state is not None:
-            given = observation.state.get(self.state)  # a client may have computed it
-            state = proprioception(observation.state, self.arm)[self.state] if given is None else given
-            fields[STATE_KEY] = torch.from_numpy(state)
+            given = observation.state.get(self.state)  # of a robot; or a client may have computed it
+            if given is None and self.state != MOTORS:
+                given = proprioception(observation.state, self.arm)[self.state]
+            assert given is not None  # `state_kind` found it among those of the environment
+            fields[STATE_KEY] = torch.from_numpy(given)
+
         return fields
 
 
@@ -86,7 +99,7 @@ def input_map(
         cameras[camera] = raw_field
     _check_action(loaded_config, env, policy)
     arm = robot_of_spec(env)
-    kind = _state_kind(loaded_config, preprocessor, options.state, policy, arm)
+    kind = _state_kind(loaded_config, preprocessor, options.state, policy, env)
     return InputMap(cameras=cameras, state=kind, arm=arm)
 
 
@@ -115,10 +128,15 @@ def _lens_problems(config: Any, inputs: InputMap, env: EnvSpec) -> list[str]:
     if trained is None:
         return []
     return [
-        f"field of view of {camera.name}: expected {trained:.4f} rad, found {camera.fov_rad:.4f} rad"
+        f"field of view of {camera.name}: expected {trained:.4f} rad, found {_fov(camera)}"
         for camera in env.cameras
-        if camera.name in inputs.cameras and abs(camera.fov_rad - trained) > MAX_FOV_DIFFERENCE_RAD
+        if camera.name in inputs.cameras
+        and (camera.fov_rad is None or abs(camera.fov_rad - trained) > MAX_FOV_DIFFERENCE_RAD)
     ]
+
+
+def _fov(camera: CameraSpec) -> str:
+    return "one that is not known" if camera.fov_rad is None else f"{camera.fov_rad:.4f} rad"
 
 
 def _gripper_problems(loaded: LoadedPolicy) -> list[str]:
@@ -176,8 +194,8 @@ def _expected_cameras(config: Any, absent: Sequence[str], policy: str) -> dict[s
 
 
 def _state_kind(
-    config: Any, preprocessor: Any, wanted: StateKind | None, policy: str, arm: Arm
-) -> StateKind | None:
+    config: Any, preprocessor: Any, wanted: StateKind | None, policy: str, env: EnvSpec
+) -> GivenState | None:
     feature = config.robot_state_feature
     if feature is None:
         return None
@@ -187,7 +205,12 @@ def _state_kind(
         (int(np.asarray(value).size) for name, value in statistics.items() if name != "count"), None
     )
     n_dims = int(feature.shape[0]) if n_dims is None else n_dims
-    sizes = {kind: len(names) for kind, names in state_names(arm).items()}
+    offered_states = {one.name: len(one.dims) for one in env.states}
+    sizes: dict[GivenState, int] = {}
+    if offered_states.keys() >= set(PROPRIO_STATES):
+        sizes |= {kind: len(names) for kind, names in state_names(robot_of_spec(env)).items()}
+    if MOTORS in offered_states:
+        sizes[MOTORS] = offered_states[MOTORS]
     fitting = [kind for kind, size in sizes.items() if size == n_dims]
     if wanted is None and len(fitting) == 1:
         return fitting[0]

@@ -22,7 +22,7 @@ from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, histo
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
 from vla_eval.core import ActionChunk, EpisodeStart, MemoryArrays, ObservationWindow
 from vla_eval.errors import InvalidActionError, SpecMismatchError
-from vla_eval.features import ACTION_KEY, CAMERA_KEYS, PROPRIO_STATES, STATE_KEY, StateKind
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY, StateKind
 from vla_eval.models.episodes.memory import memory_of, recall, remembers, remembers_in_rows, remembers_singly
 from vla_eval.models.episodes.named_memory import MemoryLayout
 from vla_eval.models.episodes.running import (
@@ -116,7 +116,7 @@ class LeRobotPolicy:
             name=name,
             reads="every" if reads_more else "last",
             cameras=tuple(inputs.cameras),
-            states=PROPRIO_STATES if inputs.state is not None else (),
+            states=inputs.states,
             chunk_size=chunk_size(loaded.config),
             reads_committed=joining is not None,
             has_memory=self._layout is not None and not self._layout.is_empty,

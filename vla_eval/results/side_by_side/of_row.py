@@ -37,6 +37,7 @@ OWN = "this repository's"
 SUITES: Mapping[Suite, str] = {
     "paper": OWN,
     "objects": OWN,
+    "real_twin": OWN,
     "mikasa_vla_90": "MIKASA-Robo-VLA",
     "mikasa_official": "MIKASA-Robo v0",
     "mikasa_base": "MIKASA-Base",

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla_eval.robots.arm import Xyz
-from vla_eval.tasks.interface import BASE_CAMERA_EYE_M, BASE_CAMERA_TARGET_M, CAMERA_FOV_RAD
+from vla_eval.tasks.interface import BASE_CAMERA_M, CAMERA_FOV_RAD
 from vla_eval.tasks.objects.item_names import THING_NAMES
 from vla_eval.tasks.objects.layout import (
     DISC_Y_M,
@@ -131,7 +131,7 @@ def free_places_m(areas: tuple[Area, ...], *, base_m: Xyz) -> Plane:
     most `N_PLACES`. None is in the way of the robot whose root is at `base_m`, world frame.
     """
     grid = np.stack(np.meshgrid(GRID_X_M, GRID_Y_M, indexing="ij"), axis=-1).reshape(-1, 2)
-    eye = np.array(BASE_CAMERA_EYE_M)
+    eye = np.array(BASE_CAMERA_M[0])
     height = THING_HEIGHT_M / (eye[2] - THING_HEIGHT_M)
     # What the top of a thing hides is on the table, from its foot on away from the camera.
     shares = np.linspace(0, height, N_SHADOW)[:, None, None]
@@ -148,11 +148,12 @@ def free_places_m(areas: tuple[Area, ...], *, base_m: Xyz) -> Plane:
 
 def _seen(points_m: Plane) -> Any:  # (…) bool
     """Return (…) whether points on the table are in the base camera's image, not at its very edge."""
-    ahead = np.array(BASE_CAMERA_TARGET_M) - np.array(BASE_CAMERA_EYE_M)
+    eye, target = map(np.array, BASE_CAMERA_M)
+    ahead = target - eye
     ahead /= np.linalg.norm(ahead)
     right = np.cross(ahead, (0.0, 0.0, 1.0))
     right /= np.linalg.norm(right)
-    ways = np.concatenate((points_m, np.zeros((*points_m.shape[:-1], 1))), axis=-1) - BASE_CAMERA_EYE_M
+    ways = np.concatenate((points_m, np.zeros((*points_m.shape[:-1], 1))), axis=-1) - eye
     edge = ways @ ahead * math.tan(CAMERA_FOV_RAD / 2) * SEEN_SHARE
     return (np.abs(ways @ right) <= edge) & (np.abs(ways @ np.cross(right, ahead)) <= edge)
 

@@ -1,0 +1,231 @@
+"""Run what has no result yet of an evaluation on an arm: one episode after another, each stored at once.
+
+The loop is `rollout`, the environment `RobotEnv`. An episode that cannot be run to its end is an error, with
+its cause, and the same command runs it again. Nothing moves before the operator has confirmed the dry run.
+"""
+
+import dataclasses
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from vla_eval.config.evaluation import CaptureConfig
+from vla_eval.core import EpisodeStart, ObservationWindow, Stage, StepObserver, infer
+from vla_eval.envs.robot.robot_env import SLOT, RobotEnv, Station
+from vla_eval.episode_log import chunk_problem
+from vla_eval.errors import InvalidActionError, RobotBusError, TooManyErrorsError
+from vla_eval.real.evaluation import RUN, RealEvaluation
+from vla_eval.real.mark_images import MarkImages
+from vla_eval.real.plan import PlannedEpisode
+from vla_eval.real.policies import SessionPolicies
+from vla_eval.records import EpisodeRecord, EpisodeTiming
+from vla_eval.rollout import rollout
+from vla_eval.seeding import seed_global_generators
+from vla_eval.storage.run_folder import RunFolder
+from vla_eval.tasks import real_stages
+from vla_eval.tasks.real_stages import COLORS, Trial
+from vla_eval.viz.capture import EpisodeCapture
+from vla_eval.workers.messages import describe_error
+
+MAX_CONSECUTIVE_ERRORS = 5
+TIMED: tuple[Stage, ...] = ("reset", "step", "inference")
+LIMITS = ("control_hz", "max_step", "response_seconds", "stale_frames", "max_gap_seconds")
+"""Settings that the dry run shows."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionSummary:
+    """The result of one call of `run_session`.
+
+    Attributes:
+        n_open: episodes without a result: not run, or ended in an error.
+        n_errors: how many ended in an error in this call.
+    """
+
+    n_episodes: int
+    n_open: int
+    n_errors: int
+
+
+@dataclass(slots=True)
+class _StageClock:
+    """Seconds of an episode, by what was being done; asks before each whether the session has to stop."""
+
+    stops: Callable[[], bool]
+    stage: Stage = "setup"
+    began: float = field(default_factory=time.monotonic)
+    seconds: dict[Stage, float] = field(default_factory=lambda: dict.fromkeys(TIMED, 0.0))
+
+    def __call__(self, stage: Stage) -> None:
+        if self.stops():
+            raise KeyboardInterrupt
+        self._add_up()
+        self.stage = stage
+
+    def timing(self, record: EpisodeRecord) -> EpisodeTiming:
+        """Return the times of the episode that has just ended."""
+        self._add_up()
+        return EpisodeTiming(
+            key=record.key,
+            total_seconds=sum(self.seconds.values()),
+            reset_seconds=self.seconds["reset"],
+            step_seconds=self.seconds["step"],
+            inference_seconds=self.seconds["inference"],
+        )
+
+    def _add_up(self) -> None:
+        now = time.monotonic()
+        if self.stage in self.seconds:
+            self.seconds[self.stage] += now - self.began
+        self.began = now
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Session:
+    """An evaluation beside an arm that is connected."""
+
+    evaluation: RealEvaluation
+    station: Station
+    say: Callable[[str], None]  # shows a line to the operator
+    stops: Callable[[], bool] = lambda: False  # asked several times a second
+    capture: CaptureConfig = field(default_factory=CaptureConfig)
+    policies: SessionPolicies = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Load the policies: a mistake appears before anything is written."""
+        envs = {stage: self._env(stage) for stage in self.evaluation.stages}
+        specs = {stage.name: env.spec for stage, env in envs.items()}
+        object.__setattr__(self, "policies", SessionPolicies(self.evaluation, specs))
+
+    def dry_run(self) -> list[str]:
+        """Read the arm, ask each policy once, command nothing; return what a person has to check.
+
+        Raises:
+            RobotError: the arm cannot be read.
+            VlaEvalError: a policy does not fit.
+        """
+        station, lines = self.station, []
+        for name, position in zip(station.link.motors, station.link.read().motors.tolist(), strict=True):
+            limits = station.settings.limits.get(name)
+            within = "no limits" if limits is None else f"within {limits[0]:g} to {limits[1]:g}"
+            home = station.settings.home.get(name)
+            at_home = "home is here" if home is None else f"home {home:g}"
+            lines.append(f"motor {name}: {position:.1f}, {within}, {at_home}")
+        for camera in station.link.cameras:
+            lines.append(f"camera {camera.name}: {camera.width_px} x {camera.height_px}")
+        lines += [f"{name}: {getattr(station.settings, name):g}" for name in LIMITS]
+        rows = {(one.policy, one.trial.stage.name): one for one in reversed(self.evaluation.plan)}
+        for planned in rows.values():
+            self._ask(planned)
+        return [*lines, f"answers of policies, one per stage: {len(rows)}"]
+
+    def run(self, *, command: str, allow_environment_change: bool = False) -> SessionSummary:
+        """Run the episodes that have no result; errors as `RunFolder.open`, and those of set-up.
+
+        Raises:
+            TooManyErrorsError: so many episodes in a row ended in an error.
+            RobotBusError: the arm does not come back after a fault.
+            OperatorError: the operator does not want to continue.
+        """
+        evaluation = self.evaluation
+        description = evaluation.describe(
+            command=command, options={"capture": self.capture.video, "lerobot": evaluation.robot.lerobot}
+        )
+        groups = {evaluation.key(planned)[:3] for planned in evaluation.plan}
+        n_errors = n_in_row = 0
+        with RunFolder.open(
+            evaluation.out, description, allow_environment_change=allow_environment_change, groups=groups
+        ) as folder:
+            finished = folder.finished_keys()
+            waiting = [one for one in evaluation.plan if evaluation.key(one) not in finished]
+            for index, planned in enumerate(waiting):
+                record, timing = self._run_one(planned, folder)
+                folder.append(record, timing)
+                is_error = record.error is not None
+                n_errors, n_in_row = n_errors + is_error, n_in_row + 1 if is_error else 0
+                n_done = len(evaluation.plan) - len(waiting) + index + 1
+                self.say(f"{n_done} of {len(evaluation.plan)} episodes; errors: {n_errors}")
+                if is_error:
+                    self._after_error(planned.trial, record, n_in_row)
+            n_finished = len(folder.finished_keys())
+        n_episodes = len(evaluation.plan)
+        return SessionSummary(n_episodes=n_episodes, n_open=n_episodes - n_finished, n_errors=n_errors)
+
+    def _run_one(
+        self, planned: PlannedEpisode, folder: RunFolder
+    ) -> tuple[EpisodeRecord, EpisodeTiming | None]:
+        """Run an episode; whatever goes wrong becomes its error, and the arm is stopped."""
+        evaluation, trial = self.evaluation, planned.trial
+        env, policy = self._env(trial.stage, trial), self.policies.of(planned)
+        start = EpisodeStart(
+            slot=SLOT,
+            task=env.spec.task,
+            seed=trial.seed,
+            run=RUN,
+            instruction=trial.stage.instruction,
+            horizon_steps=env.spec.horizon_steps,
+        )
+        settings = evaluation.rollout(evaluation.entry(planned.policy, trial.stage))
+        seed_global_generators("episodes", start.task, start.run, start.seed)
+        capture = EpisodeCapture(config=self.capture, folder=folder.path, seed_start=0)
+        tapes = capture.tapes([start], with_images=True) if self.capture.is_on else None
+        observers: list[StepObserver] = [MarkImages(folder.path, trial.number), *([tapes] if tapes else [])]
+        clock = _StageClock(self.stops)
+        try:
+            (record,) = rollout(env, policy, [start], settings, observers=observers, heartbeat=clock)
+        except Exception as exc:  # of the arm, the operator, the policy: none of them is a failure
+            key = evaluation.key(planned)._asdict()
+            return EpisodeRecord(**key, outcome="error", error=describe_error(exc, clock.stage)), None
+        finally:
+            env.stop()
+        record = dataclasses.replace(record, policy=planned.policy)
+        timing = clock.timing(record)
+        if tapes:
+            chunking = settings.chunking
+            capture.write(
+                [start],
+                tapes,
+                [record],
+                env=env.spec,
+                chunking=chunking,
+                heartbeat=clock,
+                film=lambda one: one,
+            )
+        return record, timing
+
+    def _after_error(self, trial: Trial, record: EpisodeRecord, n_in_row: int) -> None:
+        """Have the arm ready again, and ask whether to continue."""
+        assert record.error is not None
+        cause = f"{record.error.kind} during {record.error.stage}: {record.error.message}"
+        if n_in_row >= MAX_CONSECUTIVE_ERRORS:
+            raise TooManyErrorsError(
+                f"{n_in_row} episodes in a row ended in an error. The last: episode {trial.number}: "
+                f"{cause} All results are kept in {self.evaluation.out}; the same command runs the others."
+            )
+        self.station.operator.ask(
+            f"{cause}\nThe episode is run again by the same command. Continue with the next?"
+        )
+        if record.error.kind == RobotBusError.__name__:
+            self.station.link.reconnect()
+
+    def _env(self, stage: real_stages.Stage, *trials: Trial) -> RobotEnv:
+        return RobotEnv(self.station, stage, {one.seed: one for one in trials})
+
+    def _ask(self, planned: PlannedEpisode) -> None:
+        """Ask a policy for a chunk on what the arm sees now; nothing is executed."""
+        env, policy, stage = self._env(planned.trial.stage), self.policies.of(planned), planned.trial.stage
+        start = EpisodeStart(
+            slot=SLOT,
+            task=env.spec.task,
+            seed=planned.trial.seed,
+            run=RUN,
+            instruction=stage.instruction,
+            horizon_steps=env.spec.horizon_steps,
+        ).worded({"color": COLORS[planned.trial.color]})
+        policy.reset([start])
+        (chunk,) = infer(
+            policy, [ObservationWindow(slot=SLOT, frames=(env.look().as_declared(policy.spec),))]
+        )
+        problem = chunk_problem(chunk, chunk_size=policy.spec.chunk_size, dims=env.spec.action.dims)
+        if problem is not None:
+            raise InvalidActionError(f"policy '{policy.spec.name}', dry run of {stage.name}: {problem}")
