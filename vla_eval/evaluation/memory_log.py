@@ -1,11 +1,12 @@
 """What a policy remembers after each inference, and what there was to see: files for linear probes."""
 
+import math
 import os
 import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +28,7 @@ from vla_eval.task_state import PrivilegedState
 
 FRAME_PX, LARGER_FRAME_PX = 16, 32
 """Height and width of frames beside a memory, and alone: colours and places survive, texture does not."""
+MOST_STEPS = 80  # of which each has a frame alone: longer than any of our tasks waits
 MAX_BYTES = 2**30  # of a file when it is unpacked: more than a thousand inferences of any memory of ours
 MEMORY, FRAME, STEPS, IN_CUE, SHOWN = "memory/", "frame/", "steps", "in_cue", "shown"
 
@@ -129,22 +131,37 @@ class MemoryLog(NpzLog):
         log.frames.append({camera: small(image, FRAME_PX) for camera, image in images.items()})
 
 
+class _Wait(NamedTuple):
+    """The control steps of an episode of which frames are kept: every so many, and from the response on."""
+
+    every: int = 1
+    response_step: int = 0
+
+    def keeps(self, step: int) -> bool:
+        return step % self.every == 0 or step >= self.response_step
+
+
 class FrameLog(NpzLog):
-    """Keeps a small frame of each control step until the response, and of its first."""
+    """Keeps a small frame of each control step until the response, and of its first.
+
+    Of an episode that waits for more than `MOST_STEPS` control steps, it keeps every second, third … frame.
+    """
 
     def __init__(self) -> None:
         """Nothing is written before `write`."""
         super().__init__(frames_file)
-        self._waiting: set[int] = set()  # slots before the response
+        self._waiting: dict[int, _Wait] = {}  # by slot, before the response
 
     def wants_images(self, step: int) -> bool:
-        """Whether an episode is before its response."""
-        return step == 0 or bool(self._waiting)
+        """Whether a frame of this step is kept of an episode before its response."""
+        return step == 0 or any(wait.keeps(step) for wait in self._waiting.values())
 
     def on_reset(self, episode: EpisodeStart, result: StepResult) -> None:
         """Begin an episode."""
         self._logs[episode.slot] = _Log()
-        self._waiting.add(episode.slot)
+        state = result.observation.privileged
+        n_steps = state.response_step if isinstance(state, PrivilegedState) else 0
+        self._waiting[episode.slot] = _Wait(max(1, math.ceil(n_steps / MOST_STEPS)), n_steps)
         self._keep(episode.slot, result)
 
     def on_step(self, episode: EpisodeStart, action: FloatArray, result: StepResult) -> None:
@@ -154,6 +171,8 @@ class FrameLog(NpzLog):
 
     def _keep(self, slot: int, result: StepResult) -> None:
         log, seen = self._logs[slot], result.observation
+        if not self._waiting[slot].keeps(seen.step):
+            return
         # Where an environment does not show its phase to the outside, its true state has it.
         state = seen.privileged if isinstance(seen.privileged, PrivilegedState) else None
         phase = result.status.phase if state is None else state.phase
@@ -164,7 +183,7 @@ class FrameLog(NpzLog):
             candidates = np.arange(len(state.candidate_positions_m))
             log.shown.append(np.isin(candidates, state.shown_candidates))
         if phase == "response":
-            self._waiting.discard(slot)
+            del self._waiting[slot]
 
 
 def _write(log: _Log, path: Path) -> None:
