@@ -68,7 +68,7 @@ class CameraWatch:
             if self._n_same[name] >= self._stale_frames:
                 raise RobotCameraError(
                     f"camera '{name}': expected new images, found the same one {self._n_same[name]} times "
-                    "in a row (stale_frames). It is frozen, or covered: check it, then run the command again."
+                    "in a row (stale_frames). It is frozen: check it, then run the command again."
                 )
 
 
