@@ -55,6 +55,8 @@ NOT_EXECUTED: Mapping[str, str] = {
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
     r"audit --stored-frames.*": "twenty episodes at least; tests/audit/test_stored_frames.py",
+    r"real --robot bench_3.yaml .*": "an arm; tests/envs/test_robot_env.py",
+    r"real .*--rehearse .*": "faults, which end with 3; tests/real/test_real_command.py",
     r"report .* --card .*": "a card of a checkpoint; tests/results/test_model_card.py",
     r"reproduce .*": "up to hundreds of episodes; tests/cli/test_reproduce.py",
     r"serve --policy pi05 .*": "fetched weights and a GPU; tests/cli/test_serve.py",

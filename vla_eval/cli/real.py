@@ -177,10 +177,11 @@ def _session(
             stops=stops,
             capture=CaptureConfig(video="all" if args.capture_video else "none"),
         )
+        show = print if args.dry_run else _say  # then it is the result
         for line in session.dry_run():
-            _say(line)
+            show(line)
         if args.dry_run:
-            _say(f"{len(evaluation.plan)} episodes in {evaluation.out}. Nothing was commanded.")
+            show(f"{len(evaluation.plan)} episodes in {evaluation.out}. Nothing was commanded.")
             return None
         station.operator.ask("Is all of this right, is the arm free, and may it move?")
         return session.run(command=typed_command(), allow_environment_change=args.allow_environment_change)
