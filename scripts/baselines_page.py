@@ -84,8 +84,8 @@ mikasa-vla passport baselines/positive_control runs/first
 mikasa-vla compare baselines/positive_control
 ```
 
-Success once, with its 95 % interval, over seeds 1 to 50. Rows of one table agree in their
-[passports](passport.md), but for what the columns say."""
+Success once, with its 95 % interval, over seeds 1 to 50. Rows of one table agree in every setting of
+their [passports](passport.md), but for what the columns say."""
 NOT_RUN = "<!-- not run: {} -->"
 
 
