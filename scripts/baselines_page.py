@@ -5,11 +5,9 @@ from functools import partial
 from pathlib import Path
 
 from vla_eval.evaluation.model_table import finetunings, load_model_table
-from vla_eval.results.grouping import group_runs
 from vla_eval.results.passport.passport import merged
 from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, cells_of, write_tables
 from vla_eval.results.report import build_table
-from vla_eval.results.side_by_side.of_row import passports_of
 from vla_eval.results.side_by_side.written import passport_table
 from vla_eval.results.statistics import printed_columns
 from vla_eval.results.success_table import Row, Table
@@ -86,7 +84,6 @@ mikasa-vla compare baselines/positive_control
 
 Success once, with its 95 % interval, over seeds 1 to 50. Rows of one table agree in every setting of
 their [passports](passport.md), but for what the columns say."""
-NOT_RUN = "<!-- not run: {} -->"
 
 
 def runs_of(section: Section) -> list[Path]:
@@ -103,16 +100,15 @@ def page() -> str:
 
 
 def _section(section: Section) -> list[str]:
-    runs = [read_run(path) for path in runs_of(section)]
-    table = build_table(runs)
+    table = build_table([read_run(path) for path in runs_of(section)])
     table = replace(table, rows=tuple(sorted(table.rows, key=_place)))
     printed = lay_out(table, names=section.columns) if section.columns else _by_task(table)
     shown = PrintedTable(columns=printed.columns, rows=printed.rows)
-    passports = list(passports_of(group_runs(runs)).values())
+    passports = list(table.passports.values())
     return [
         f"## {section.title}",
         section.says,
-        NOT_RUN.format("takes hours"),
+        "<!-- not run: takes hours -->",
         f"```\n{section.commands}\n```",
         write_tables([shown], "markdown"),
         write_tables([passport_table([merged(passports, subject="all rows")])], "markdown"),
