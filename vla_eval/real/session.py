@@ -35,7 +35,7 @@ LIMITS = ("control_hz", "max_step", "response_seconds", "stale_frames", "max_gap
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionSummary:
-    """The result of one call of `run_session`.
+    """The result of one call of `Session.run`.
 
     Attributes:
         n_open: episodes without a result: not run, or ended in an error.
@@ -157,14 +157,7 @@ class Session:
         """Run an episode; whatever goes wrong becomes its error, and the arm is stopped."""
         evaluation, trial = self.evaluation, planned.trial
         env, policy = self._env(trial.stage, trial), self.policies.of(planned)
-        start = EpisodeStart(
-            slot=SLOT,
-            task=env.spec.task,
-            seed=trial.seed,
-            run=RUN,
-            instruction=trial.stage.instruction,
-            horizon_steps=env.spec.horizon_steps,
-        )
+        start = _start(env, trial)
         settings = evaluation.rollout(evaluation.entry(planned.policy, trial.stage))
         seed_global_generators("episodes", start.task, start.run, start.seed)
         capture = EpisodeCapture(config=self.capture, folder=folder.path, seed_start=0)
@@ -181,13 +174,12 @@ class Session:
         record = dataclasses.replace(record, policy=planned.policy)
         timing = clock.timing(record)
         if tapes:
-            chunking = settings.chunking
             capture.write(
                 [start],
                 tapes,
                 [record],
                 env=env.spec,
-                chunking=chunking,
+                chunking=settings.chunking,
                 heartbeat=clock,
                 film=lambda one: one,
             )
@@ -214,14 +206,7 @@ class Session:
     def _ask(self, planned: PlannedEpisode) -> None:
         """Ask a policy for a chunk on what the arm sees now; nothing is executed."""
         env, policy, stage = self._env(planned.trial.stage), self.policies.of(planned), planned.trial.stage
-        start = EpisodeStart(
-            slot=SLOT,
-            task=env.spec.task,
-            seed=planned.trial.seed,
-            run=RUN,
-            instruction=stage.instruction,
-            horizon_steps=env.spec.horizon_steps,
-        ).worded({"color": COLORS[planned.trial.color]})
+        start = _start(env, planned.trial).worded({"color": COLORS[planned.trial.color]})
         policy.reset([start])
         (chunk,) = infer(
             policy, [ObservationWindow(slot=SLOT, frames=(env.look().as_declared(policy.spec),))]
@@ -229,3 +214,14 @@ class Session:
         problem = chunk_problem(chunk, chunk_size=policy.spec.chunk_size, dims=env.spec.action.dims)
         if problem is not None:
             raise InvalidActionError(f"policy '{policy.spec.name}', dry run of {stage.name}: {problem}")
+
+
+def _start(env: RobotEnv, trial: Trial) -> EpisodeStart:
+    return EpisodeStart(
+        slot=SLOT,
+        task=env.spec.task,
+        seed=trial.seed,
+        run=RUN,
+        instruction=trial.stage.instruction,
+        horizon_steps=env.spec.horizon_steps,
+    )
