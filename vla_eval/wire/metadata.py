@@ -14,8 +14,6 @@ from vla_eval.strict.json_text import shown
 
 PROTOCOL = "openpi+1"
 SUPPORTS = ("reset", "observe", "seed", "row")
-"""Of an `infer`: what is left of the chunk under way, (N, A) float32, and how many of its rows are frozen,
-see `CommittedActions`. No published server has such keys: openpi's and LeRobot's take none over a socket."""
 NOT_COMPARED = ("n_sessions", "training_seeds", "sentences")
 
 MAX_ACTIONS = 10_000  # of one reply
