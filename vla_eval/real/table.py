@@ -1,30 +1,15 @@
 """The table of an evaluation on an arm: touched and picked, per stage and policy, as the paper has it."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from vla_eval.records import EpisodeRecord
-from vla_eval.results.estimates import p_above, wilson_interval
+from vla_eval.results.estimates import Share, p_above
 from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable
 from vla_eval.tasks.real_stages import CHANCE, COLORS, PAPER_EPISODES, STAGES, Rates, Stage, stage_of
 
 PAPER = "π0.5 (paper)"
 TOTAL = "Total"
-
-
-class Counted(NamedTuple):
-    """How many of how many."""
-
-    n: int
-    of: int
-
-    @property
-    def text(self) -> str:
-        """Return `0.63 [0.46, 0.78]`; a dash without an episode."""
-        interval = wilson_interval(self.n, self.of)
-        if interval is None:
-            return UNDEFINED
-        return f"{self.n / self.of:.2f} [{interval.low:.2f}, {interval.high:.2f}]"
 
 
 class StageRow(NamedTuple):
@@ -34,14 +19,19 @@ class StageRow(NamedTuple):
     policy: str
     n_episodes: int
     n_errors: int | None
-    touched: Counted
-    picked: Counted
+    touched: Share | None  # None: without an episode that has a result
+    picked: Share | None
     by_color: tuple[Rates | None, ...]
 
 
 def is_touched(record: EpisodeRecord) -> bool:
     """Whether the right cube was touched, whatever else was."""
     return record.target in (record.touched_candidates or ())
+
+
+def is_picked(record: EpisodeRecord) -> bool:
+    """Whether the right cube was picked."""
+    return bool(record.success_once)
 
 
 def stage_rows(records: Sequence[EpisodeRecord]) -> list[StageRow]:
@@ -60,8 +50,8 @@ def stage_rows(records: Sequence[EpisodeRecord]) -> list[StageRow]:
                     policy=policy,
                     n_episodes=len(results),
                     n_errors=len(own) - len(results),
-                    touched=_counted(is_touched(one) for one in results),
-                    picked=_counted(bool(one.success_once) for one in results),
+                    touched=Share.counted(results, is_touched),
+                    picked=Share.counted(results, is_picked),
                     by_color=tuple(_rates(results, color) for color in range(len(COLORS))),
                 )
             )
@@ -71,7 +61,7 @@ def stage_rows(records: Sequence[EpisodeRecord]) -> list[StageRow]:
 def paper_row(stage: Stage) -> StageRow:
     """Return the paper's row of a stage."""
     total = stage.paper[TOTAL]
-    touched, picked = (Counted(round(rate * PAPER_EPISODES), PAPER_EPISODES) for rate in total)
+    touched, picked = (Share(round(rate * PAPER_EPISODES), PAPER_EPISODES) for rate in total)
     return StageRow(
         stage=stage,
         policy=PAPER,
@@ -83,12 +73,12 @@ def paper_row(stage: Stage) -> StageRow:
     )
 
 
-def p_below(counted: Counted) -> float:
+def p_below(touched: Share) -> float:
     """Return the probability of at most so many touches of the right cube by an arm that guesses one.
 
     Source: one-sided exact binomial test.
     """
-    return 1 - p_above(counted.n + 1, counted.of, CHANCE) if counted.n < counted.of else 1.0
+    return 1 - p_above(touched.n + 1, touched.of, CHANCE) if touched.n < touched.of else 1.0
 
 
 COLUMNS: tuple[Column[StageRow], ...] = (
@@ -96,8 +86,8 @@ COLUMNS: tuple[Column[StageRow], ...] = (
     Column("policy", lambda row: row.policy, is_number=False),
     Column("episodes", lambda row: str(row.n_episodes)),
     Column("errors", lambda row: UNDEFINED if row.n_errors is None else str(row.n_errors)),
-    Column("is_touched", lambda row: row.touched.text),
-    Column("is_picked", lambda row: row.picked.text),
+    Column("is_touched", lambda row: _share(row.touched)),
+    Column("is_picked", lambda row: _share(row.picked)),
     *(
         Column(color, lambda row, index=index: _pair(row.by_color[index]))  # type: ignore[misc]
         for index, color in enumerate(COLORS)
@@ -127,8 +117,7 @@ def _notes(rows: Sequence[StageRow]) -> Iterator[str]:
         "the three cubes at random."
     )
     for row in rows:
-        p = p_below(row.touched)
-        if row.touched.of and p < 0.05:
+        if row.touched is not None and (p := p_below(row.touched)) < 0.05:
             yield (
                 f"{row.policy} on {row.stage.name}: {row.touched.n} of {row.touched.of} touched is below "
                 f"chance (p = {p:.3f}, exact binomial test, one-sided): it does not guess, or does not get "
@@ -141,17 +130,16 @@ def _notes(rows: Sequence[StageRow]) -> Iterator[str]:
         )
 
 
-def _counted(flags: Iterable[bool]) -> Counted:
-    found = list(flags)
-    return Counted(sum(found), len(found))
-
-
 def _rates(results: Sequence[EpisodeRecord], color: int) -> Rates | None:
     own = [one for one in results if one.target == color]
     if not own:
         return None
-    touched, picked = sum(map(is_touched, own)), sum(bool(one.success_once) for one in own)
+    touched, picked = sum(map(is_touched, own)), sum(map(is_picked, own))
     return Rates(touched / len(own), picked / len(own))
+
+
+def _share(share: Share | None) -> str:
+    return UNDEFINED if share is None else str(share)
 
 
 def _pair(rates: Rates | None) -> str:
