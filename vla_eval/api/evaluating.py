@@ -13,9 +13,10 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of
 from vla_eval.config.protocol import fill_from_protocol
 from vla_eval.errors import RecipeError
-from vla_eval.evaluation.resolve import FINGERPRINT_DIGITS, RUNS_FOLDER, ResolvedEvaluation
+from vla_eval.evaluation.resolve import FINGERPRINT_DIGITS, ResolvedEvaluation
 from vla_eval.policies.entries import PolicyEntry, load_policy_entry
 from vla_eval.policies.given import given_entry
+from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.strict.calls import public
 from vla_eval.workers.in_process import IN_PROCESS
 from vla_eval.workers.local import LOCAL

@@ -138,8 +138,9 @@ def run(args: argparse.Namespace) -> int:
     )
     from vla_eval.cli.terminal.progress import stop_on_signals
     from vla_eval.evaluation.needed_files import needed_files
-    from vla_eval.evaluation.resolve import RUNS_FOLDER, ResolvedEvaluation
+    from vla_eval.evaluation.resolve import ResolvedEvaluation
     from vla_eval.policies.entries import load_policy_entries, refuse_unfetched
+    from vla_eval.storage.run_file import RUNS_FOLDER
     from vla_eval.storage.run_folder import read_run
 
     if args.config is not None:

@@ -15,11 +15,11 @@ from vla_eval.errors import RecipeError, some_of
 from vla_eval.evaluation.delay_trace import RunDelays
 from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.recipe import bare_policy
+from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.storage.shard import Shard, shard_folder
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
 
-RUNS_FOLDER = Path("runs")
 FINGERPRINT_DIGITS = 8
 INFERENCE_FIELDS = ("inference", "inference_max_batch")
 

@@ -17,6 +17,7 @@ from vla_eval.evaluation.model_table import (
     load_model_table,
     narrow,
 )
+from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.strict.bounds import MAX_SECONDS
 from vla_eval.training.finetune_jobs import RUNNER, Finetuned, FinetuneJob
 from vla_eval.workers.backend import Backend, Pool
@@ -27,7 +28,6 @@ from vla_eval.workers.messages import Failed
 from vla_eval.workers.needed_files import Needed, shared_folder
 from vla_eval.workers.process import WorkerSpec
 
-RUNS_FOLDER = Path("runs")
 Say = Callable[[str], None]
 """Takes a line for a person."""
 
