@@ -25,9 +25,8 @@ def open_robot(settings: RobotSettings) -> Any:
         MissingDependencyError: its driver is not installed.
     """
     with own_need():
-        importlib.import_module("vla_eval.envs.robot.simulated")  # registers it
+        simulated = importlib.import_module("vla_eval.envs.robot.simulated")  # registers it
     if settings.is_simulated:
-        simulated = importlib.import_module("vla_eval.envs.robot.simulated")
         return simulated.SimulatedSO100(_config(settings.lerobot))
     let_everything(f"{settings.type} is a device: its drivers open ports and cameras")
     _register()

@@ -55,7 +55,6 @@ class InputMap:
                 given = proprioception(observation.state, self.arm)[self.state]
             assert given is not None  # `state_kind` found it among those of the environment
             fields[STATE_KEY] = torch.from_numpy(given)
-
         return fields
 
 

@@ -11,14 +11,13 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.widowx.widowx import WidowX250S
 from mani_skill.sensors.camera import CameraConfig
 
-from vla_eval.control_modes import EE_DELTA_POSE
+from vla_eval.control_modes import DELTA_M, DELTA_RAD, EE_DELTA_POSE
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.rows import WIDOWX
 from vla_eval.tasks.arm.robots import KeptConfigs, downloaded
 from vla_eval.tasks.arm.small_arms import TOOL_LINK, urdf_with_tool
 from vla_eval.tasks.interface import CAMERA_FOV_RAD
 
-DELTA_M, DELTA_RAD = 0.1, 0.1  # of the hand at an action of 1, as with the Panda
 # Of ManiSkill's agent for scenes of BridgeData, `WidowX250SBridgeDatasetFlatTable`.
 STIFFNESS = (1169.79, 730.0, 808.46, 1229.13, 1272.28, 1056.33)
 DAMPING = (330.0, 180.0, 152.12, 309.62, 201.05, 269.51)
