@@ -14,6 +14,7 @@ from lerobot.policies import make_pre_post_processors
 from lerobot.policies.act.configuration_act import ACTConfig
 from lerobot.policies.diffusion.configuration_diffusion import DiffusionConfig
 from lerobot.policies.pi0.configuration_pi0 import PI0Config
+from lerobot.policies.smolvla.configuration_smolvla import SmolVLAConfig
 
 from vla_eval.checkpoints.files import TrainingFacts
 from vla_eval.checkpoints.loading import make_empty_policy
@@ -29,6 +30,7 @@ from vla_eval.testing.tiny_models import (
     make_tiny,
     tiny_paligemma,
     tiny_resnet,
+    write_tiny_smolvlm,
     write_tiny_tokenizer,
 )
 
@@ -133,6 +135,23 @@ def diffusion(backbone: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
         spatial_softmax_num_keypoints=4,
     )
     return save(with_features(config), tmp_path_factory.mktemp("diffusion") / "model")
+
+
+@pytest.fixture(scope="module")
+def smolvla(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("smolvla")
+    config = SmolVLAConfig(
+        device="cpu",
+        push_to_hub=False,
+        chunk_size=8,
+        n_action_steps=8,
+        num_steps=2,
+        num_vlm_layers=2,
+        resize_imgs_with_padding=(64, 64),
+        load_vlm_weights=False,
+        vlm_model_name=str(write_tiny_smolvlm(folder / "model" / "vlm")),
+    )
+    return save(with_features(config), folder / "model")
 
 
 @pytest.fixture(scope="module")

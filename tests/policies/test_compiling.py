@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from transformers.models.smolvlm.configuration_smolvlm import SmolVLMVisionConfig
+from transformers.models.smolvlm.modeling_smolvlm import SmolVLMVisionTransformer
 
 from tests.checkpoints.small_checkpoints import (
     act,
@@ -21,6 +23,7 @@ from tests.checkpoints.small_checkpoints import (
     env,
     observation,
     pi0,
+    smolvla,
     start,
     window,
 )
@@ -34,7 +37,7 @@ from vla_eval.policies.lerobot.policy import LeRobotPolicy, make_lerobot
 from vla_eval.specs import EnvSpec
 from vla_eval.testing.tiny_models import make_tiny
 
-__all__ = ["act", "backbone", "diffusion", "env", "pi0"]  # fixtures
+__all__ = ["act", "backbone", "diffusion", "env", "pi0", "smolvla"]  # fixtures
 
 
 @pytest.fixture
@@ -99,6 +102,39 @@ class TestNetwork:
         assert all(
             torch._inductor.config.get_config_copy().keys() >= asked.keys() - {"dynamic"} for asked in traced
         )
+
+
+def test_positions_of_patches_are_traced_and_are_the_same(traced: list[dict[str, Any]]) -> None:
+    sizes = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 1}
+    torch.manual_seed(0)
+    vision = SmolVLMVisionTransformer(SmolVLMVisionConfig(**sizes, image_size=32, patch_size=8)).eval()
+    images = {size: torch.rand(2, 3, *size) for size in ((32, 32), (16, 24))}  # of another size, too
+    expected = {size: vision(image).last_hidden_state for size, image in images.items()}
+
+    compiling.keep_positions(vision.embeddings)
+
+    run = torch.compile(lambda image: vision(image).last_hidden_state, dynamic=False, options={})
+    for size, image in images.items():
+        with torch.compiler.set_stance("force_eager"):
+            assert torch.equal(run(image), expected[size])
+        before = compiling._n_graphs()
+        assert torch.equal(run(image), expected[size])
+        assert compiling._n_graphs() - before == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["act", "pi0", "smolvla"])
+def test_prefix_and_denoising_steps_are_one_graph(
+    kind: str, env: EnvSpec, traced: list[dict[str, Any]], request: pytest.FixtureRequest
+) -> None:
+    plain, compiled = (made(request.getfixturevalue(kind), env, **args) for args in ({}, {"compile": True}))
+    before = compiling._n_graphs()
+
+    found = compiled.warm_up(env, ("touch it",))
+
+    assert compiling._n_graphs() - before == 1
+    assert found is not None and found.difference == 0
+    np.testing.assert_array_equal(actions(compiled), actions(plain))
 
 
 class TestWarmUp:

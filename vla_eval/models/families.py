@@ -71,6 +71,7 @@ def _octo_base(size: str, revision: str, fields: Mapping[str, Any]) -> Base:
 _SMOLVLA = Family(
     type="smolvla",
     is_built_empty=True,
+    traced_positions="model.vlm_with_expert.vlm.model.vision_model.embeddings",
     noise="flow",
     stages=f"{_STAGES}:smolvlm_with_expert",
     stand_in=f"{_STAND_INS}:smolvlm",

@@ -79,6 +79,8 @@ class Family:
     # what is compiled where `compile` asks for it: functions of the policy, as `attribute.attribute`
     compiled: tuple[str, ...] = ("predict_action_chunk",)
     not_compiled: str = ""  # why it is not
+    # its embeddings of patches, as `attribute.attribute`, whose positions torch cannot trace
+    traced_positions: str = ""
     cuts_chunk: bool = False  # its `predict_action_chunk` returns `n_action_steps` actions and no more
     noise: Noise | None = None  # what it can be given in place of its own draws
     lora_targets: str | None = None  # modules that get an adapter, where lerobot's own choice is wrong

@@ -13,6 +13,7 @@ from typing import Any  # lerobot is untyped
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch._functorch import config as functorch_config
 from torch._inductor.cpu_vec_isa import pick_vec_isa
 
@@ -52,11 +53,46 @@ def compile_network(loaded: Any, *, policy: str) -> None:
         options["triton.cudagraphs"] = True
     with own_need():  # it tries in a process of its own which vectors the processor knows, and keeps that
         pick_vec_isa()
-    for path in family_of(config.type).compiled:
+    family = family_of(config.type)
+    if family.traced_positions:
+        keep_positions(_part(network, family.traced_positions.split(".")))
+    for path in family.compiled:
         *parents, name = path.split(".")
-        owner = functools.reduce(getattr, parents, network)
+        owner = _part(network, parents)
         made = torch.compile(getattr(owner, name), dynamic=False, options=options)
         setattr(owner, name, _guarded(made, policy))
+
+
+def keep_positions(embeddings: Any) -> None:
+    """Let a vision model's embeddings look up the positions of patches once per shape of its images.
+
+    SmolVLM picks the patches that a mask shows, and torch cannot trace how many these are: ten graphs in the
+    place of one. LeRobot gives no mask, so that all patches are shown, at the same positions each time.
+    """
+    forward = embeddings.forward
+    known: dict[tuple[torch.Size, torch.dtype], Tensor] = {}
+
+    def run(pixel_values: Tensor, patch_attention_mask: Tensor) -> Tensor:
+        key = (pixel_values.shape, pixel_values.dtype)
+        if key in known:
+            patches = embeddings.patch_embedding(pixel_values).flatten(2).transpose(1, 2)
+            embedded: Tensor = patches + embeddings.position_embedding(known[key])
+            return embedded
+        if torch.compiler.is_compiling():
+            unknown: Tensor = forward(pixel_values, patch_attention_mask)
+            return unknown
+        kept = embeddings.position_embedding.register_forward_pre_hook(
+            lambda _, args: known.update({key: args[0]})
+        )
+        with kept:
+            first: Tensor = forward(pixel_values, patch_attention_mask)
+        return first
+
+    embeddings.forward = run
+
+
+def _part(network: Any, names: Sequence[str]) -> Any:
+    return functools.reduce(getattr, names, network)
 
 
 def begin_pass(device: str) -> None:
