@@ -9,7 +9,7 @@ from torch import Tensor
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
-from vla_eval.models.episodes.samples import Episodes, count_motions, episodes_of
+from vla_eval.models.episodes.samples import AT_REST_M, Episodes, after_waiting, count_motions, episodes_of
 from vla_eval.models.sequence.configuration_sequence import MikasaSequenceConfig
 from vla_eval.models.shared.images import in_numbers
 
@@ -219,3 +219,32 @@ class TestMotions:
         actions = torch.ones(1, 6, 7)
         real = torch.tensor([[False, False, True, True, True, True]])
         assert count_motions(actions, real).tolist() == [1]
+
+
+class TestWaitingOn:
+    def test_an_arm_rests_until_its_first_motion(self) -> None:
+        given = waits_then_moves()
+        given[STATE_KEY][:, 1] = AT_REST_M / 2 / 10**0.5  # it settles
+        given[STATE_KEY][1, 2] = 2 * AT_REST_M  # of one episode, somebody pushes it, and it comes back
+
+        rests = episodes_of(given, config(), training=False).rests
+
+        assert rests[0].tolist() == [False, True, True, True, False]
+        assert rests[1].tolist() == [False, True, False, False, False]
+
+    def test_a_chunk_after_waiting_on_is_the_same_motion_later(self) -> None:
+        given = waits_then_moves()
+        given[ACTION_KEY][..., -1] = 1.0  # the gripper is held open
+        given[ACTION_PADDING_KEY][:, -2:] = True
+        before = episodes_of(given, config(), training=False)
+        n_rows = torch.randint(0, CHUNK, before.steps.shape)
+
+        after = after_waiting(before, n_rows)
+
+        waiting = torch.tensor([0.0] * 6 + [1.0])
+        for row in range(N_EPISODES):
+            for step in range(N_STEPS):
+                n = int(n_rows[row, step]) if 1 <= step <= 3 else 0  # not once it has moved
+                expected = torch.cat([waiting.expand(n, -1), before.actions[row, step, : CHUNK - n]])
+                assert torch.equal(after.actions[row, step], expected)
+                assert torch.equal(after.counts[row, step, n:], before.counts[row, step, : CHUNK - n])

@@ -11,7 +11,7 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from torch import Tensor
 
 from vla_eval.models.sequence.heads import FlowHead, PrefixReader
-from vla_eval.models.shared.prefix import Prefix, drawn_prefix
+from vla_eval.models.shared.prefix import Prefix, drawn_lengths, prefix_of
 
 WIDTH, CHUNK, DIMS = 16, 6, 2
 
@@ -31,7 +31,7 @@ def trained(prefix_steps: int = 0) -> FlowHead:
     optimizer = torch.optim.Adam(head.parameters(), lr=3e-3)
     decided, actions = (values.repeat(16, *[1] * (values.dim() - 1)) for values in demonstrations())
     for _ in range(400):
-        prefix = drawn_prefix(actions, prefix_steps) if prefix_steps else None
+        prefix = prefix_of(actions, drawn_lengths(actions, prefix_steps)) if prefix_steps else None
         errors = head.errors(decided, actions, prefix)
         loss = errors.mean() if prefix is None else (errors * ~prefix.mask).sum() / (~prefix.mask).sum()
         optimizer.zero_grad()
@@ -94,7 +94,7 @@ class TestPrefix:
 
     def test_lengths_are_drawn_from_none_to_the_most_alike(self) -> None:
         torch.manual_seed(0)
-        prefix = drawn_prefix(torch.zeros(3000, CHUNK, DIMS), 3)
+        prefix = prefix_of(chunks := torch.zeros(3000, CHUNK, DIMS), drawn_lengths(chunks, 3))
         lengths = prefix.mask.sum(dim=1)
 
         assert (prefix.mask == (torch.arange(CHUNK) < lengths[:, None])).all()  # from the first row on

@@ -14,6 +14,7 @@ from vla_eval.models.shared.ported_config import PortedConfig
 LEAST_VARIANCE_M2 = 1e-6
 LEAST_WEIGHT = 1e-12
 SAME_ACTION = 1e-3  # actions that differ by less are waiting
+AT_REST_M = 1e-3  # an arm that has not come further than this since the episode began has only waited
 MOTION_BEGINS = 0.5
 """By so much more than the one before it, in units of the controller's limits, a translation moves the arm
 where a motion begins. Then all of 1,500 demonstrations of six tasks with one place to go to have one motion;
@@ -33,6 +34,9 @@ class Episodes(NamedTuple):
     goal_counts: Tensor  # (B, T) float, how much the goal counts at each step
     goal_m: Tensor  # (B, 3) the tool centre point at the episode's end
     steps: Tensor  # (B, T) which step of the window each is
+    # (B, T) whether the arm has only waited before this step, so that waiting on leaves the world as it is
+    rests: Tensor
+    waiting: Tensor  # (B, action) the action it waited with, where it did
 
     @property
     def frames(self) -> Tensor:
@@ -43,6 +47,19 @@ class Episodes(NamedTuple):
     def real(self) -> Tensor:
         """(B, T) False for padding: the first action of a chunk counts at every other step."""
         return self.counts.sum(dim=-1) > 0
+
+
+def after_waiting(episodes: Episodes, n_rows: Tensor) -> Episodes:
+    """Return them with chunks that begin with `n_rows` (B, T) more of waiting, where the arm rests."""
+    chunk = episodes.actions.shape[2]
+    rows = torch.arange(chunk, device=n_rows.device) - (n_rows * episodes.rests)[..., None]
+    moved = rows.clamp(min=0)
+    actions = episodes.actions.gather(2, moved[..., None].expand_as(episodes.actions))
+    waits = (rows < 0)[..., None]
+    return episodes._replace(
+        actions=torch.where(waits, episodes.waiting[:, None, None], actions),
+        counts=episodes.counts.gather(2, moved),
+    )
 
 
 def last_of(chosen: Tensor) -> Tensor:
@@ -112,7 +129,19 @@ def episodes_of(
         goal_counts=counts.sum(dim=-1) * taken(can_know),
         goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
         steps=steps,
+        rests=taken(_rests(waits, batch[STATE_KEY][:, :n_steps, :SPACE])),
+        waiting=actions[:, 0, 0],
     )
+
+
+def _rests(waits: Tensor, place_m: Tensor) -> Tensor:
+    """Return (B, T): whether all actions before a step were the same and the tool did not move, (B, T, 3)."""
+    waited = torch.zeros_like(waits)  # not known of the first step, which has no action before it
+    waited[:, 1:] = True
+    waited[:, 2:] = waits[:, 1:-1].cumprod(dim=1).bool()
+    away = (place_m - place_m[:, :1]).norm(dim=-1).cummax(dim=1).values
+    rests: Tensor = waited & (away < AT_REST_M)
+    return rests
 
 
 def count_motions(actions: Tensor, real: Tensor) -> Tensor:

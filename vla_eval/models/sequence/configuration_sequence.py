@@ -43,7 +43,7 @@ class MikasaSequenceConfig(EpisodeConfig):
     head: str = "gated"
     num_inference_steps: int = 10  # of the integration from noise to actions, with head=flow
     # in training, up to so many first actions of a chunk are given (drawn), and only the rest is learned: for
-    # chunking.mode=prefix
+    # chunking.mode=prefix. Half of those given while the arm has only waited are of waiting on.
     prefix_steps: int = 0
     tokens: str = "step"  # of a step, a name of `TOKENS`
     state_in_token: bool = True  # the token of an observation has the state in it, not only the images

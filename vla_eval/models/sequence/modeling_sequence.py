@@ -12,7 +12,13 @@ from torch import Tensor, nn
 from vla_eval.features import REWARD_KEY, STATE_KEY, RewardKind
 from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
 from vla_eval.models.episodes.policy import EpisodePolicy
-from vla_eval.models.episodes.samples import Episodes, goal_missed, stacked_images, weighted_mean
+from vla_eval.models.episodes.samples import (
+    Episodes,
+    after_waiting,
+    goal_missed,
+    stacked_images,
+    weighted_mean,
+)
 from vla_eval.models.episodes.sentence import SentenceEncoder, said_at_each_step, with_sentence
 from vla_eval.models.sequence.configuration_sequence import TYPE, MikasaSequenceConfig
 from vla_eval.models.sequence.core import CoreMemory
@@ -21,7 +27,9 @@ from vla_eval.models.sequence.encoders import Cameras
 from vla_eval.models.sequence.heads import FlowHead, Gated, PrefixReader
 from vla_eval.models.sequence.sizes import CORES
 from vla_eval.models.shared.precision import in_float32
-from vla_eval.models.shared.prefix import Prefix, drawn_prefix
+from vla_eval.models.shared.prefix import Prefix, drawn_lengths, prefix_of
+
+WAITS_SHARE = 0.5  # of the prefixes where the arm rests: so many are of waiting
 
 
 class Demonstrated(NamedTuple):
@@ -174,7 +182,7 @@ class MikasaSequencePolicy(EpisodePolicy):
         tokens = encoded[episodes.frames]
         answers = network.answers(tokens, self._demonstrated(batch, episodes))
         decided = network.decide(tokens, answers)
-        prefix = drawn_prefix(episodes.actions, config.prefix_steps) if config.prefix_steps else None
+        episodes, prefix = self._with_prefix(episodes)
         counts = episodes.counts if prefix is None else episodes.counts * ~prefix.mask
         imitation = weighted_mean(network.errors(decided, episodes.actions, prefix), counts)
         # Weighted as the actions are: once the arm moves, its motion gives the goal away, and the one frame
@@ -183,6 +191,19 @@ class MikasaSequencePolicy(EpisodePolicy):
         parts = {"imitation": imitation, "goal": goal}
         loss = imitation + config.goal_weight * goal
         return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+    def _with_prefix(self, episodes: Episodes) -> tuple[Episodes, Prefix | None]:
+        """Draw what is decided of each chunk; where the arm rests, in half of them, that it waits on.
+
+        A policy that acts with a delay has often decided to wait when the decision comes. No demonstration
+        shows that: there the motion begins at once.
+        """
+        if not self.config.prefix_steps:
+            return episodes, None
+        lengths = drawn_lengths(episodes.actions, self.config.prefix_steps)
+        waits = torch.rand(lengths.shape, device=lengths.device) < WAITS_SHARE
+        episodes = after_waiting(episodes, lengths * waits)
+        return episodes, prefix_of(episodes.actions, lengths)
 
     def _demonstrated(self, batch: dict[str, Tensor], episodes: Episodes) -> Demonstrated | None:
         if not self.config.reads_returns:

@@ -17,10 +17,14 @@ class Prefix(NamedTuple):
         return torch.where(self.mask[..., None], self.actions, actions)
 
 
-def drawn_prefix(actions: Tensor, most_steps: int) -> Prefix:
-    """Return a prefix of 0 to `most_steps` rows, drawn for each chunk (…, chunk, action), for training.
+def drawn_lengths(like: Tensor, most_steps: int) -> Tensor:
+    """Return how many rows are decided, 0 to `most_steps`, drawn for each chunk (…, chunk, action).
 
     Source: Black et al. 2025 (arXiv:2512.05964), section 3: the delay is simulated in training.
     """
-    lengths = torch.randint(0, most_steps + 1, (*actions.shape[:-2], 1), device=actions.device)
-    return Prefix(actions, torch.arange(actions.shape[-2], device=actions.device) < lengths)
+    return torch.randint(0, most_steps + 1, like.shape[:-2], device=like.device)
+
+
+def prefix_of(actions: Tensor, lengths: Tensor) -> Prefix:
+    """Return the first `lengths` (…) rows of chunks (…, chunk, action)."""
+    return Prefix(actions, torch.arange(actions.shape[-2], device=actions.device) < lengths[..., None])
