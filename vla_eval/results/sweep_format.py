@@ -151,23 +151,24 @@ def _columns(sweep: Sweep) -> list[Column[SweepRow]]:
 
 def _motion_columns(sweep: Sweep) -> list[Column[SweepRow]]:
     """Return how the arm moved, as far as some row has a value; the first to go where it is narrow."""
-
-    def column(
-        rank: int, title: str, value: Callable[[SweepRow], float | None], form: str
-    ) -> Column[SweepRow]:
-        return Column(title, lambda row: shown(value(row), form), rank=rank)
-
-    values: dict[str, tuple[Callable[[SweepRow], float | None], str]] = {
-        "held": (lambda row: TIMING.estimate(row.evidence).held_share, ".2f"),
-        "delay": (lambda row: TIMING.estimate(row.evidence).mean_delay_steps, ".1f"),
-        "jump": (lambda row: SMOOTHNESS.estimate(row.evidence).border_jump, ".2f"),
-        "turn jump": (lambda row: SMOOTHNESS.estimate(row.evidence).border_turn_jump, ".2f"),
-        "jerk m/s³": (lambda row: SMOOTHNESS.estimate(row.evidence).jerk_m_s3, ".1f"),
+    timing = [TIMING.estimate(row.evidence) for row in sweep.rows]
+    smoothness = [SMOOTHNESS.estimate(row.evidence) for row in sweep.rows]
+    values: dict[str, tuple[list[float | None], str]] = {
+        "held": ([one.held_share for one in timing], ".2f"),
+        "delay": ([one.mean_delay_steps for one in timing], ".1f"),
+        "jump": ([one.border_jump for one in smoothness], ".2f"),
+        "turn jump": ([one.border_turn_jump for one in smoothness], ".2f"),
+        "jerk m/s³": ([one.jerk_m_s3 for one in smoothness], ".1f"),
     }
+
+    def column(rank: int, title: str, of_rows: list[float | None], form: str) -> Column[SweepRow]:
+        cells = {row.key: shown(value, form) for row, value in zip(sweep.rows, of_rows, strict=True)}
+        return Column(title, lambda row: cells[row.key], rank=rank)
+
     return [
-        column(10 + number, title, value, form)
-        for number, (title, (value, form)) in enumerate(values.items())
-        if any(value(row) for row in sweep.rows)
+        column(10 + number, title, of_rows, form)
+        for number, (title, (of_rows, form)) in enumerate(values.items())
+        if any(of_rows)
     ]
 
 

@@ -25,12 +25,11 @@ from .check_client import (
     shown,
 )
 from .noise import PAIRS, SEEDS
-from .numbers import COMMITTED_ACTIONS_KEY, MEMORY
+from .numbers import CHUNKING_MODES, COMMITTED_ACTIONS_KEY, MEMORY
 
 __all__ = ["CheckFailedError", "check_remote"]
 
 PROTOCOL = "openpi+1"
-CHUNKING_MODES = ("rtc", "prefix")
 IMAGE_SIZE_PX = 128  # of a camera whose size the server does not say
 NO_CODEC_BYTE = b"\xc1"  # the one byte that msgpack never begins with
 BY_SESSION = (

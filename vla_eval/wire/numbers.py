@@ -23,6 +23,8 @@ GET_MEMORY, SET_MEMORY = "memory/get", "memory/set"
 COMMITTED_ACTIONS_KEY, COMMITTED_FROZEN_KEY = "committed/actions", "committed/n_frozen"
 """Of a request: the actions left of the chunk under way, (N, A) float32, and how many will be executed in any
 case. No published server has such keys: openpi's and LeRobot's take none over a socket."""
+CHUNKING_MODES = ("rtc", "prefix")
+"""How chunks may join what is committed (docs/real_time.md)."""
 MAX_MEMORY_BYTES = 32 * 2**20  # of all arrays of a memory in a message
 MAX_MEMORY_ARRAYS = 1024
 

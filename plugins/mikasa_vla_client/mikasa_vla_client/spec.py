@@ -14,6 +14,7 @@ from typing import Any, Mapping
 import numpy as np
 
 from mikasa_vla_client.numbers import (
+    CHUNKING_MODES,
     COMMITTED_ACTIONS_KEY,
     COMMITTED_FROZEN_KEY,
     MEMORY,
@@ -29,8 +30,6 @@ CAMERA_KEYS = {"base_camera": "observation/image", "hand_camera": "observation/w
 """Camera of the simulator -> key in an observation, as in openpi's policy for LIBERO."""
 
 STATE_KEY, PROMPT_KEY = "observation/state", "prompt"
-CHUNKING_MODES = ("rtc", "prefix")
-"""How chunks may join what is committed; `docs/real_time.md` of mikasa-vla-eval says what each does."""
 _POSE = ("x", "y", "z", "qw", "qx", "qy", "qz")
 _JOINTS = ("joint1", "joint2", "joint3", "joint4", "joint5", "joint6", "joint7", "finger1", "finger2")
 STATE_LAYOUTS = {
