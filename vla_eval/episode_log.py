@@ -123,6 +123,7 @@ class EpisodeLog:
             right_candidates=status.right_candidates if has_candidates else None,
             touched_candidates=status.touched_candidates if has_candidates else None,
             candidate_places=status.candidate_places or None,
+            candidate_names=status.candidate_names or None,
             final_turn_rad=status.turned_rad,
             n_held_steps=self.inferred_at_steps.count(HELD),
             mean_age_steps=sum(ages) / len(ages) if ages else None,

@@ -24,7 +24,7 @@ LATER_FIELDS = frozenset(
     {
         *("chance_success", "target_place", "first_choice_place", "tcp_reach_m"),
         *("right_candidates", "touched_candidates", "candidate_places", "final_turn_rad"),
-        *("n_held_steps", "mean_age_steps", "delay_steps", "motion"),
+        *("n_held_steps", "mean_age_steps", "delay_steps", "motion", "candidate_names"),
     }
 )
 """Fields that records of earlier versions of this program do not have."""
@@ -83,6 +83,7 @@ class EpisodeRecord:
         right_candidates, touched_candidates: the right ones, in the order shown, and those touched, in the
             order of first touch; None as above, and in records of earlier versions.
         candidate_places: where each candidate lay, counted as above.
+        candidate_names: what the candidates are, where that is not a fact of the task (`env.meshes`).
         final_turn_rad: how far the object was turned at the end, counterclockwise seen from above; None in
             tasks that do not ask for it.
         chance_success: success rate of a perfect arm that ignores the cue, with the arguments of this
@@ -127,6 +128,7 @@ class EpisodeRecord:
     right_candidates: tuple[Count, ...] | None = None
     touched_candidates: tuple[Count, ...] | None = None
     candidate_places: tuple[Count, ...] | None = None
+    candidate_names: tuple[str, ...] | None = None
     final_turn_rad: float | None = None
     n_held_steps: Count | None = None
     mean_age_steps: Distance | None = None
@@ -142,6 +144,8 @@ class EpisodeRecord:
     def to_json(self) -> str:
         """Return the record as one line of JSON, without the line's end."""
         data = {"record_version": RECORD_VERSION, **asdict(self)}
+        if self.candidate_names is None:
+            del data["candidate_names"]  # so that earlier versions of this program read the record
         return json.dumps(data, ensure_ascii=False, allow_nan=False)
 
     @classmethod
@@ -340,6 +344,14 @@ OF_A_RESULT = (
         ("n_candidates", "candidate_places"),
         "a place of its own for each candidate",
         lambda one: one.candidate_places is None or _is_permutation(one.candidate_places, one.n_candidates),
+    ),
+    Rule(
+        ("n_candidates", "candidate_names"),
+        "a name of its own for each candidate",
+        lambda one: (
+            one.candidate_names is None
+            or (len({*one.candidate_names}) == one.n_candidates and all(map(is_name, one.candidate_names)))
+        ),
     ),
 )
 

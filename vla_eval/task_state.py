@@ -33,6 +33,8 @@ class TaskStatus:
     # success rate of a perfect arm that ignores the cue, with the arguments of this environment; None
     # where it has to be measured
     chance_success: float | None = None
+    # names of the candidates, in their order, where they are not those of the task; else empty
+    candidate_names: tuple[str, ...] = ()
     # the place at which each candidate lies when the response phase begins, in candidate order: 0 is the
     # rightmost as the robot sees it (-y). Empty where places are not known.
     candidate_places: tuple[int, ...] = ()

@@ -44,12 +44,12 @@ RECORD = EpisodeRecord(
     right_candidates=(2,),
     touched_candidates=(2, 0),
     candidate_places=(0, 2, 1),
+    candidate_names=("ball", "a cup", "ell"),
 )
 ADDED_ALONE = frozenset(
     {
-        *("tcp_reach_m", "chance_success"),
-        *("right_candidates", "touched_candidates", "candidate_places", "final_turn_rad"),
-        *("n_held_steps", "mean_age_steps", "delay_steps", "motion"),
+        *("tcp_reach_m", "chance_success", "right_candidates", "touched_candidates", "candidate_places"),
+        *("final_turn_rad", "n_held_steps", "mean_age_steps", "delay_steps", "motion", "candidate_names"),
     }
 )
 """Fields that records of earlier versions lack, each independent of the others."""

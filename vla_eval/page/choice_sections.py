@@ -103,7 +103,9 @@ def _habit(report: ChoiceReport, kind: Kind, task: str) -> str:
 
 
 def _names(report: ChoiceReport, kind: Kind, task: str) -> tuple[str, ...]:
-    return item_names(task if kind == "item" else "", report.n_candidates)
+    if kind != "item":
+        return item_names("", report.n_candidates)
+    return item_names(task, report.n_candidates, given=report.candidate_names)
 
 
 def _matrix(report: ChoiceReport, kind: Kind, task: str) -> Matrix:

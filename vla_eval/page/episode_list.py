@@ -32,13 +32,14 @@ def episode_list(material: Material, folder: Path | None) -> EpisodeList:
     for number, row in enumerate(material.table.rows):
         group = row.episodes
         n_candidates = max((record.n_candidates or 0 for record in group.results), default=0)
+        given = next((record.candidate_names for record in group.results if record.candidate_names), None)
         rows.append(
             {
                 "task": row.task,
                 "policy": row.policy,
                 "k": row.n_action_steps,
                 "setting": material.table.variants[row.variant] if row.variant else None,
-                "items": item_names(row.task, n_candidates) if n_candidates else [],
+                "items": item_names(row.task, n_candidates, given=given) if n_candidates else [],
             }
         )
         for run in group.runs:

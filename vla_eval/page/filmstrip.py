@@ -82,7 +82,7 @@ def _row(record: EpisodeRecord, path: Path) -> SheetRow:
         raise ViewingError(f"{path}: {problem}") from exc
     lines = [f"seed {record.seed}"] + ([f"run {record.run}"] if record.run else [])
     if record.n_candidates and record.target is not None:
-        names = item_names(record.task, record.n_candidates)
+        names = item_names(record.task, record.n_candidates, given=record.candidate_names)
         chosen = "none" if record.first_choice is None else names[record.first_choice]
         lines += [f"cue {names[record.target]}", f"chose {chosen}"]
     edge = SUCCESS_COLOR if record.outcome == "success" else FAILURE_COLOR

@@ -147,7 +147,7 @@ def _video(one: _Captured) -> Video:
         f"{record.task} · {record.policy} · K={record.n_action_steps} · seed {record.seed}: {record.outcome}"
     )
     if record.n_candidates:
-        names = item_names(record.task, record.n_candidates)
+        names = item_names(record.task, record.n_candidates, given=record.candidate_names)
         chosen = "none" if record.first_choice is None else names[record.first_choice]
         name += f", target {UNDEFINED if record.target is None else names[record.target]}, chosen {chosen}"
     thumbnail = thumbnail_file(one.run.path, record)

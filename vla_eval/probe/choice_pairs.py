@@ -51,7 +51,10 @@ def choice_pairs(worlds: Worlds, policy: str, n_action_steps: int) -> list[Choic
                 world=world,
                 policy=policy,
                 n_action_steps=n_action_steps,
-                names=(*item_names(world.task, n_candidates), NO_CHOICE),
+                names=(
+                    *item_names(world.task, n_candidates, given=pairs[0].drawn.candidate_names),
+                    NO_CHOICE,
+                ),
                 counts=Counter(choices),
                 following=Counter(compress(choices, followed)),
                 pairs=tuple(pairs),

@@ -38,6 +38,7 @@ class ChoiceReport:
     """The choices of a row's episodes with candidates."""
 
     n_candidates: int
+    candidate_names: tuple[str, ...] | None  # where records have them
     causes: Mapping[Cause, int]  # cause -> number of episodes; contains every cause
     # by item and by place: (target, chosen or None) -> number of episodes. Empty if it was not recorded,
     # or if several candidates are right.
@@ -67,6 +68,7 @@ def report_choices(group: RowEpisodes) -> ChoiceReport | None:
     causes = Counter(_cause(record, habits["place"]) for record in results)
     return ChoiceReport(
         n_candidates=n_candidates,
+        candidate_names=next((one.candidate_names for one in results if one.candidate_names), None),
         causes={cause: causes[cause] for cause in CAUSES},
         confusion=confusion,
         habits=habits,

@@ -49,6 +49,8 @@ class ChoiceEnv(MemoryTableEnv):
     touch_height_m = 0.0
     """Height of the point to touch over a candidate's centre."""
     candidates: list[Actor]
+    candidate_names: tuple[str, ...] = ()
+    """Names of the candidates where the task's id does not say them."""
     in_order = False
     """Whether right candidates, if there are several, must be touched in the order of `right_candidates`."""
 
@@ -210,6 +212,7 @@ class ChoiceEnv(MemoryTableEnv):
             n_wrong_choices=int(info["n_wrong_choices"][env]),
             right_first_choices=right[:1] if self.in_order else right,
             chance_success=self.chance_success(),
+            candidate_names=self.candidate_names,
             candidate_places=self._places[env],
             right_candidates=right,
             touched_candidates=self.touched_candidates(env),

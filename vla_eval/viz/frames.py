@@ -10,7 +10,7 @@ from vla_eval.config.environment import HUMAN_CAMERA
 from vla_eval.core import ImageArray
 from vla_eval.records import EpisodeRecord
 from vla_eval.task_state import Phase
-from vla_eval.tasks.objects.item_names import item_names, item_rgb
+from vla_eval.tasks.objects.item_names import item_names, rgb_of
 from vla_eval.viz.tape import EpisodeTape, TapedStep
 
 VIEW_PX = 512  # the large view; the others are half of it, one below the other
@@ -84,17 +84,18 @@ def _step_parts(tape: EpisodeTape, taped: TapedStep, task: str, n_held: int) -> 
     texts += [f"held {n_held} x"] if n_held > 1 else []
     parts = [Part(text=text) for text in texts]
     if status.n_candidates:
+        names = item_names(task, status.n_candidates, given=status.candidate_names)
         parts += [
-            _item_part("target", "several", status.target, task, status.n_candidates),
-            _item_part("chosen", "none yet", status.first_choice, task, status.n_candidates),
+            _item_part("target", "several", status.target, names, is_color=not status.candidate_names),
+            _item_part("chosen", "none yet", status.first_choice, names, is_color=not status.candidate_names),
         ]
     return parts
 
 
-def _item_part(kind: str, missing: str, index: int | None, task: str, n_items: int) -> Part:
+def _item_part(kind: str, missing: str, index: int | None, names: Sequence[str], *, is_color: bool) -> Part:
     if index is None:
         return Part(text=f"{kind} {missing}")
-    return Part(text=f"{kind} {item_names(task, n_items)[index]}", swatch=item_rgb(task, n_items, index))
+    return Part(text=f"{kind} {names[index]}", swatch=rgb_of(names[index]) if is_color else None)
 
 
 def _write(

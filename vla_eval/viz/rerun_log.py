@@ -65,7 +65,7 @@ def write_rrd(tape: EpisodeTape, record: EpisodeRecord, path: Path, *, env: EnvS
 
 def _log_facts(stream: rr.RecordingStream, tape: EpisodeTape, record: EpisodeRecord) -> None:
     status = tape.steps[-1].result.status
-    names = item_names(record.task, status.n_candidates)
+    names = item_names(record.task, status.n_candidates, given=status.candidate_names)
     target = "several, or none" if status.target is None else names[status.target]
     chosen = "none" if status.first_choice is None else names[status.first_choice]
     lines = [

@@ -161,7 +161,7 @@ def _strip(run: StoredRun, record: EpisodeRecord) -> Filmstrip:
     frames = read_strip(
         video_file(run.path, record), n_frames=N_FRAMES, n_steps=record.n_steps, control_hz=CONTROL_HZ
     )
-    names = item_names(record.task, record.n_candidates or 0)
+    names = item_names(record.task, record.n_candidates or 0, given=record.candidate_names)
     target = "several" if record.target is None else names[record.target]
     chosen = "none" if record.first_choice is None else names[record.first_choice]
     return Filmstrip(

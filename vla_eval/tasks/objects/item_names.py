@@ -3,6 +3,8 @@
 In the official order, which is that of the indices in records (`target`, `first_choice`).
 """
 
+from collections.abc import Sequence
+
 # Values and order of the official code, which calls (0, 255, 0) "Lime" and (255, 128, 0) "Olive".
 COLOR_RGB = {
     "red": (255, 0, 0),
@@ -27,16 +29,19 @@ THING_NAMES = (
 _NAMES = {"RememberColor": COLOR_NAMES, "RememberShape": SHAPE_NAMES, "RememberObject": THING_NAMES}
 
 
-def item_names(task: str, n_items: int) -> tuple[str, ...]:
+def item_names(task: str, n_items: int, *, given: Sequence[str] | None = None) -> tuple[str, ...]:
     """Return the names of a task's items; of one without a name (mugs, RememberShapeAndColor) its index.
 
-    `task` is the id of a row, of a family, or of the official package: `mikasa_vla/RememberColor3-VLA-v0`.
+    `given` are those that a record has (`candidate_names`), if any: they come first. `task` is the id of
+    a row, of a family, or of the official package: `mikasa_vla/RememberColor3-VLA-v0`.
     """
+    if given:
+        return tuple(given)
     family = task.rpartition("/")[2].partition("-")[0].rstrip("0123456789")
     names = _NAMES.get(family, ())
     return names[:n_items] if len(names) >= n_items else tuple(map(str, range(n_items)))
 
 
-def item_rgb(task: str, n_items: int, index: int) -> tuple[int, int, int] | None:
-    """Return the colour of an item that its name gives, 0 to 255; None if the name is not a colour."""
-    return COLOR_RGB.get(item_names(task, n_items)[index])
+def rgb_of(name: str) -> tuple[int, int, int] | None:
+    """Return the colour that a name gives, 0 to 255; None if the name is not a colour."""
+    return COLOR_RGB.get(name)
