@@ -1,13 +1,17 @@
-"""Render the images of `docs/tasks/*.md` and `docs/clutter.md`: what the two cameras see of each task.
+"""Render the images of docs/tasks/*.md, docs/clutter.md and docs/meshes.md: what two cameras see of tasks.
 
-Usage: .venv/bin/python scripts/task_images.py [DOCS_IMAGES_FOLDER [TASK… | clutter]]
+Usage: .venv/bin/python scripts/task_images.py [DOCS_IMAGES_FOLDER [TASK… | clutter | meshes]]
 """
 
 import sys
+import tempfile
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
+import trimesh
+from PIL import Image
 
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
@@ -48,11 +52,13 @@ CLUTTERED = {  # task -> how many things
     "TakeItBack-v0": 12,
 }
 CLUTTERED_PX = 160
+MESHES = "meshes"  # name of the image of nine meshes made by trimesh
+OF_MESHES = "RememberObject9-v0"
 
 
-def picture(task: str) -> np.ndarray:
+def picture(task: str, **kwargs: Any) -> np.ndarray:
     """Return the (H, W, 3) uint8 RGB sheet of a task: a column per step, base view over wrist view."""
-    env = ManiSkillEnv(EnvSettings(task=task, cameras=CAMERAS, privileged=True))
+    env = ManiSkillEnv(EnvSettings(task=task, kwargs=kwargs, cameras=CAMERAS, privileged=True))
     chunking = ChunkingSpec(n_action_steps=1)
     policy = make_oracle(
         PolicyContext(
@@ -88,6 +94,41 @@ def cluttered(task: str) -> np.ndarray:
     return np.concatenate([_framed(result.observation.images[camera]) for camera in CAMERAS])
 
 
+def of_meshes() -> np.ndarray:
+    """Return the sheet of a task whose candidates are nine meshes in a folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        for name, mesh in toys().items():
+            mesh.export(Path(folder) / f"{name}.glb")
+        return picture(OF_MESHES, meshes=folder, image_size=CLUTTERED_PX)
+
+
+def toys() -> dict[str, trimesh.Trimesh]:
+    """Return name -> mesh, m, y up as in glTF: boxes, round things, and a corner, which is not convex."""
+    make, turned = trimesh.creation, trimesh.transformations.rotation_matrix
+    upright = make.box((0.012, 0.02, 0.028)).apply_translation((-0.014, 0.0, 0.02))
+    corner = trimesh.util.concatenate([make.box((0.04, 0.02, 0.012)), upright])
+    pill = make.capsule(radius=0.01, height=0.03).apply_transform(turned(np.pi / 2, (0, 1, 0)))
+    shapes = {
+        "ball": (make.icosphere(subdivisions=4, radius=0.018), (235, 120, 30)),
+        "board": (make.box((0.042, 0.042, 0.008)), (255, 255, 255)),
+        "brick": (make.box((0.05, 0.022, 0.018)), (170, 60, 45)),
+        "cone": (make.cone(radius=0.02, height=0.045), (60, 150, 70)),
+        "corner": (corner, (120, 80, 170)),
+        "pill": (pill, (230, 230, 225)),
+        "pillar": (make.cylinder(radius=0.012, height=0.05), (50, 90, 190)),
+        "ring": (make.torus(major_radius=0.02, minor_radius=0.008), (240, 200, 40)),
+        "washer": (make.annulus(r_min=0.01, r_max=0.025, height=0.012), (110, 115, 120)),
+    }
+    squares = np.kron(np.indices((8, 8)).sum(axis=0) % 2, np.ones((8, 8))) * 215 + 20
+    for name, (mesh, rgb) in shapes.items():
+        uv = (mesh.vertices[:, :2] - mesh.bounds[0, :2]) / mesh.extents[:2]
+        image = Image.fromarray(squares.astype(np.uint8)) if name == "board" else None
+        material = trimesh.visual.material.PBRMaterial(baseColorFactor=(*rgb, 255), baseColorTexture=image)
+        mesh.visual = trimesh.visual.TextureVisuals(uv=uv, material=material)
+        mesh.apply_transform(turned(-np.pi / 2, (1, 0, 0)))
+    return {name: mesh for name, (mesh, _) in shapes.items()}
+
+
 def _framed(image: np.ndarray) -> np.ndarray:
     return np.pad(image, ((0, GAP_PX), (0, GAP_PX), (0, 0)), constant_values=255)
 
@@ -96,8 +137,11 @@ def main() -> None:
     """Write one PNG per task."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "docs/images")
     folder.mkdir(parents=True, exist_ok=True)
-    for name in sys.argv[2:] or (*STEPS, CLUTTER):
-        columns = [cluttered(task) for task in CLUTTERED] if name == CLUTTER else [picture(name)]
+    for name in sys.argv[2:] or (*STEPS, CLUTTER, MESHES):
+        if name == MESHES:
+            columns = [of_meshes()]
+        else:
+            columns = [cluttered(task) for task in CLUTTERED] if name == CLUTTER else [picture(name)]
         sheet = cv2.cvtColor(np.concatenate(columns, axis=1), cv2.COLOR_RGB2BGR)
         cv2.imwrite(str(folder / f"{name}.png"), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 

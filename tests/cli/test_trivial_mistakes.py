@@ -23,6 +23,12 @@ WRONG_ENV = {
     "--set env.robot=so10": "Did you mean 'so100'",
     "--set env.robot=so100 --set env.control_mode=pd_ee_pose": "this arm takes pd_joint_pos",
 }
+WRONG_MESHES = {
+    "--set env.meshes=nowhere": "expected a folder of meshes",
+    "--set env.meshes=empty": "no mesh in it",
+    "--set env.mesh_scale=0.001": "without meshes",
+    "--set env.mesh=empty": "Did you mean 'meshes'?",
+}
 HEAVY = (*("torch", "lerobot", "transformers", "datasets", "mani_skill", "sapien", "cv2", "rerun"),)
 MOST_CPU_SECONDS = 2.0
 # Verb -> command lines, each with a word that the message must have.
@@ -44,6 +50,10 @@ MISTAKES: dict[str, dict[str, str]] = {
         f"eval --task {TASK} --policy act --dry-run": "has no weights",
         f"eval --task {TASK} --policy memory_color3 --n-action-steps 4 16 --dry-run": "chunks of 8 actions",
         **{f"eval --task {TASK} --policy oracle --dry-run {env}": said for env, said in WRONG_ENV.items()},
+        **{
+            f"eval --task RememberObject3-v0 --policy oracle --dry-run {env}": said
+            for env, said in WRONG_MESHES.items()
+        },
     },
     "report": {
         "report runs/nowhere": "runs/nowhere",

@@ -10,6 +10,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import pandas as pd
 
+from tests.tasks.made_meshes import folder_of_shapes
 from vla_eval.cli.main import main
 from vla_eval.config.files import list_recipes
 from vla_eval.data.manifest import MIKASA_FOLDER
@@ -127,6 +128,12 @@ def edited(_: str) -> Path:
     return _made("edited")
 
 
+@functools.cache
+def meshes(_: str) -> Path:
+    """Return a folder of ten meshes."""
+    return folder_of_shapes(_made("meshes"))
+
+
 def checkpoint(_: str) -> Path:
     """Return a shipped one."""
     return SHIPPED
@@ -134,6 +141,7 @@ def checkpoint(_: str) -> Path:
 
 STAND_INS: dict[str, Callable[[str], Path]] = {
     r".*-shard-.+-of-.+": shard,
+    r"meshes/.*": meshes,
     r"data/npz/.*": npz,
     r"data/mixed": mixed,
     r"data/foreign": foreign,

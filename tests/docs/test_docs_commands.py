@@ -25,6 +25,7 @@ from vla_eval.evaluation.model_table import is_model_table, load_model_table
 from vla_eval.strict.decoding import decode
 from vla_eval.tasks.arguments import check_arguments
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.objects.mesh_folder import MESHES
 
 ROOT = Path(__file__).parents[2]
 PAGES = [
@@ -76,7 +77,7 @@ def is_name(text: str) -> bool:
 
 def check_task(name: str, env: dict[str, Any]) -> None:
     spec = task_spec(name)
-    check_arguments(spec, env)
+    check_arguments(spec, {name: value for name, value in env.items() if name != MESHES})  # a reader's folder
 
 
 def check_names(args: argparse.Namespace) -> None:

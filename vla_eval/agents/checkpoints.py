@@ -20,6 +20,7 @@ from vla_eval.errors import TrainingError
 from vla_eval.policies.agents.network import AgentNetwork, save_network, shapes_of
 from vla_eval.storage.durable import sync_tree
 from vla_eval.strict.json_text import Source, read_file, read_json, shown
+from vla_eval.tasks.objects.mesh_folder import without_path
 from vla_eval.training.run_folder import CHECKPOINTS_FOLDER, PARTIAL_PREFIX, STATE_FOLDER, TRAIN_FOLDER, point
 
 NETWORK = "policy"  # the library's name of its network among what it saves
@@ -94,7 +95,7 @@ def _about(job: AgentJob, model: Any) -> AgentNetwork:
         algorithm=job.recipe.algorithm,
         observation=job.reader.mode,
         task=job.task,
-        env=dict(job.settings.kwargs),
+        env=without_path(job.settings.kwargs),
         shapes=shapes_of(model.observation_space),
         action_dims=job.env.action.dims,
         control_mode=job.env.action.control_mode,

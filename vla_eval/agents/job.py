@@ -24,7 +24,9 @@ from vla_eval.policies.agents.algorithms import (
 from vla_eval.policies.agents.observing import Reader, reader_of
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.specs import EnvSpec
+from vla_eval.tasks.arguments import pinned
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.objects.mesh_folder import without_path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,9 +71,11 @@ def agent_job(config: AgentConfig) -> AgentJob:
     check_arguments(row, loaded.value.arguments)
     network_fields(row, loaded.value.network)
     recipe = in_whole_updates(loaded.value, row)
+    arguments = pinned(recipe.env)
+    recipe = replace(recipe, env=without_path(arguments))
     settings = EnvSettings(
         task=task.id,
-        kwargs=_without_arm(recipe.env) if task.is_base else recipe.env,
+        kwargs=_without_arm(arguments) if task.is_base else arguments,
         simulator=recipe.simulator,
         n_slots=recipe.n_envs,
     )

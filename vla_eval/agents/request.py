@@ -9,8 +9,9 @@ from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.policy import changed_section, load_policy
 from vla_eval.errors import RecipeError
 from vla_eval.policies.agents.algorithms import Algorithm, algorithm, steps_per_update
-from vla_eval.tasks.arguments import check_arguments
+from vla_eval.tasks.arguments import check_arguments, pinned
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.objects.mesh_folder import without_path
 from vla_eval.training.request import FinetuneSummary, compared_fields
 from vla_eval.training.run_folder import REQUEST_KEY, newest_step, read_record
 
@@ -39,7 +40,7 @@ def look_for(config: AgentConfig) -> FinetuneSummary | None:
     step = newest_step(out)
     if config.held_out is not None or step == 0:
         return None
-    recipe = in_whole_updates(recipe, row)
+    recipe = in_whole_updates(replace(recipe, env=without_path(pinned(recipe.env))), row)
     asked = request_sha256(recipe, task.id, run_seed=config.run_seed)
     if step != recipe.steps or read_record(out).get(REQUEST_KEY) != asked:
         return None

@@ -31,6 +31,7 @@ from vla_eval.policies.agents.algorithms import asked_of_library, library_class,
 from vla_eval.seeding import global_generators_kept, seed_global_generators
 from vla_eval.storage.provenance import collect_environment, package_version
 from vla_eval.tasks.catalog import task_spec
+from vla_eval.tasks.objects.mesh_folder import without_path
 from vla_eval.training.held_out import HeldOut
 from vla_eval.training.request import FinetuneSummary, compared_fields
 from vla_eval.training.run_folder import (
@@ -261,7 +262,7 @@ def _open(job: AgentJob, command: str) -> Path | None:
         "recipe_sha256": job.recipe_sha256,
         "tasks": [job.task],
         "observation": job.reader.mode,
-        "env": to_data(dict(job.settings.kwargs)),
+        "env": to_data(without_path(job.settings.kwargs)),
         "environment": collect_environment(),
         "libraries": {name: package_version(name) for name in LIBRARIES},
         "command": command,

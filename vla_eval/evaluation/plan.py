@@ -47,6 +47,7 @@ from vla_eval.storage.planned import part_of
 from vla_eval.storage.shard import Shard
 from vla_eval.storage.trained_on import seen_in_training
 from vla_eval.strict.bounds import MAX_EPISODES
+from vla_eval.tasks.arguments import meshes_of
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.spec import TaskSpec
 from vla_eval.wire.metadata import ServerMetadata
@@ -57,10 +58,10 @@ class Plan:
     """The episodes of a run, and facts about them."""
 
     jobs: tuple[EpisodeJob, ...]  # every episode, in a fixed order
-    # `policies/random` -> sha256 of the file; likewise the prompts, the weights of learned policies, and
-    # the datasets that these were trained on (another dataset of the same name is `datasets/NAME of
-    # POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on, those for one task
-    # `policies/NAME/TASK/run-0`.
+    # `policies/random` -> sha256 of the file; likewise the prompts, the files of meshes, the weights of
+    # learned policies, and the datasets that these were trained on (another dataset of the same name is
+    # `datasets/NAME of POLICY`). Several checkpoints of one policy are `policies/NAME/run-0` and so on,
+    # those for one task `policies/NAME/TASK/run-0`.
     recipe_hashes: Mapping[str, str]
     # learned policy -> by which statistics it normalises, see `normalization_notes`
     normalization: Mapping[str, Mapping[str, Any]]  # Any: plain data
@@ -84,6 +85,7 @@ class Plan:
     # the part of the configuration's episodes that `jobs` are; None: all of them
     shard: Shard | None = None
     delays: RunDelays | None = None  # those that are replayed
+    about_meshes: str | None = None  # a note on a folder of meshes
 
     @property
     def warnings(self) -> list[str]:
@@ -98,12 +100,13 @@ class Plan:
 
     @property
     def notes(self) -> list[str]:
-        """What could not be compared."""
+        """What could not be compared, and what was read."""
         parts = dict.fromkeys(group.part for group in self._groups)
         unknown = [part for part in parts if part in self.sentences and self.sentences[part] is None]
         replayed = [] if self.delays is None else [self.delays.note([job.key for job in self.jobs])]
         nothing_known = [about_nothing_known(part) for part in unknown]
-        return [*nothing_known, *replayed, *self.about_measured, *self.about_skipped]
+        meshes = [] if self.about_meshes is None else [self.about_meshes]
+        return [*meshes, *nothing_known, *replayed, *self.about_measured, *self.about_skipped]
 
     @property
     def about_measured(self) -> list[str]:
@@ -158,11 +161,16 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
     if not groups:
         raise RecipeError(f"{config.name}: there is nothing to run ({'; '.join(left_out)}).")
     _refuse_too_many(config, groups)
+    meshes = meshes_of(config.env)
     limits = [policy.value.max_workers for policy in policies if policy.part(0) not in shared]
     ignored = [ignored_fields(one.adapter, one.args, chunking=one.rollout.chunking) for one in groups]
     plan = Plan(
         jobs=tuple(job for group in groups for job in _jobs(config, group)),
-        recipe_hashes=_recipe_hashes(prompts, policies, servers) | _delays_hash(resolved.delays),
+        recipe_hashes={
+            **_recipe_hashes(prompts, policies, servers),
+            **_delays_hash(resolved.delays),
+            **({} if meshes is None else meshes.hashes),
+        },
         normalization=_noted(policies, normalization_notes),
         servers={name: server.identity() for name, server in servers.items()},
         sentences=_sentences(policies, servers),
@@ -177,6 +185,7 @@ def make_plan(resolved: ResolvedEvaluation) -> Plan:
         max_workers=min((limit for limit in limits if limit is not None), default=None),
         ignored=tuple(dict.fromkeys(chain.from_iterable(ignored))),
         delays=resolved.delays,
+        about_meshes=None if meshes is None else meshes.note,
     )
     return plan if resolved.shard is None else _shard_of(plan, config, resolved.shard)
 

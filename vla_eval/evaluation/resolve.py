@@ -17,6 +17,8 @@ from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.recipe import bare_policy
 from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.storage.shard import Shard, shard_folder
+from vla_eval.tasks.arguments import pinned
+from vla_eval.tasks.objects.mesh_folder import without_path
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
 
@@ -49,6 +51,7 @@ class ResolvedEvaluation:
         """Decide where policies infer; arguments as for `resolve`, with the policies that were read."""
         if config.compile:
             policies = _compiled(policies)
+        config = replace(config, env=pinned(config.env))
         if config.inference == "auto":
             config = replace(
                 config, inference="shared" if _shares(config, policies, backend) else "in_process"
@@ -87,6 +90,7 @@ class ResolvedEvaluation:
             del data["slots_per_worker"]
         if config.inference == "in_process":
             data = {name: value for name, value in data.items() if name not in INFERENCE_FIELDS}
+        data["env"] = without_path(data["env"])
         data["policies"] = [bare_policy(name) for name in data["policies"]]
         if not config.compile:
             del data["compile"]

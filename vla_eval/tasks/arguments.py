@@ -6,7 +6,7 @@ No simulator is started: the task's row and the source of its class say it all.
 import ast
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_origin
 
 from vla_eval.config.environment import WristMesh
 from vla_eval.control_modes import CONTROL_MODE
@@ -23,8 +23,12 @@ from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.free_places import free_places_m, free_things, used_areas
 from vla_eval.tasks.objects.item_names import item_names
 from vla_eval.tasks.objects.limits import LIMITED, check_together, n_swaps
+from vla_eval.tasks.objects.mesh_folder import MESHES
 from vla_eval.tasks.source import class_constant, task_arguments
 from vla_eval.tasks.spec import TaskSpec, total_cue_steps
+
+if TYPE_CHECKING:
+    from vla_eval.tasks.objects.meshes import MeshSet
 
 HORIZON = "horizon_steps"
 OF_EVERY_TASK: Mapping[str, str] = {HORIZON: "SomeSteps", ROBOT: "str", ROBOT_UIDS: "str"}
@@ -63,12 +67,15 @@ def check_arguments(spec: TaskSpec, given: Mapping[str, object]) -> None:
     if spec.is_official:
         return
     _check_names_and_types(spec, given)
-    spec.n_candidates(given)
+    n_candidates = spec.n_candidates(given)
     _check_robot(spec, given)
     try:
         check_together(**_with_usual(spec, given))
     except TaskArgumentError as exc:
         raise TaskArgumentError(f"{spec.id}: {exc}") from exc
+    found = meshes_of(given)
+    if found is not None:
+        found.candidates(n_candidates)
     horizon_steps(spec, longest_wait_steps(spec, given), given.get(HORIZON))
 
 
@@ -115,11 +122,40 @@ def _with_usual(spec: TaskSpec, given: Mapping[str, object]) -> dict[str, Any]: 
         found["n_swaps"] = n_swaps(**found)
         if found["clutter"]:
             places_m = free_places_m(used_areas(**found), base_m=robot_of(given).base_m)
-            items = item_names(family_of(spec), spec.n_candidates(given))
+            of_task = given.get(MESHES) is None
+            items = item_names(family_of(spec), spec.n_candidates(given)) if of_task else ()
             found |= {"n_free_places": len(places_m), "n_free_things": len(free_things(items))}
     if "delay_steps" in found:
         found["least_delay"], _ = step_range("delay_steps", found["delay_steps"])
     return {**found, "one_by_one": spec.shows_one_by_one}
+
+
+def meshes_of(given: Mapping[str, Any]) -> "MeshSet | None":  # Any: plain data
+    """Return the meshes of the folder that arguments name, checked; None if they name none.
+
+    Raises:
+        TaskArgumentError: the folder is not there, or one of its meshes cannot be used.
+    """
+    if given.get(MESHES) is None:
+        return None
+    # Here and not above: what reads meshes takes long to import, and few tasks have any.
+    from vla_eval.tasks.objects.meshes import read_meshes
+
+    usual: dict[str, Any] = {"mesh_scale": 1.0, "mesh_holes": False}
+    arguments = {name: given.get(name, value) for name, value in {MESHES: None, **usual}.items()}
+    for name, kind in ((MESHES, str), ("mesh_scale", limits.MeshScale), ("mesh_holes", bool)):
+        check_argument(kind, arguments[name], name=name, task="env")
+    return read_meshes(arguments[MESHES], scale=arguments["mesh_scale"], allow_holes=arguments["mesh_holes"])
+
+
+def pinned(given: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data
+    """Return arguments in which a folder of meshes, if any, has its whole path and the digest of its files.
+
+    Raises:
+        TaskArgumentError: it is not there, or one of its meshes cannot be used.
+    """
+    found = meshes_of(given)
+    return dict(given) if found is None else {**given, MESHES: found.pinned}
 
 
 def _check_robot(spec: TaskSpec, given: Mapping[str, object]) -> None:

@@ -14,16 +14,18 @@ from vla_eval.tasks.item_choice import ItemChoiceEnv
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.bodies import Flags, Steps, anywhere
 from vla_eval.tasks.objects.item_names import MIXED_SHAPE_NAMES, N_MIXED_COLORS
-from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, cube
+from vla_eval.tasks.objects.items import COLORS, CUBE_HALF_SIZE_M, SHAPES, Item, Shape, cube
 from vla_eval.tasks.objects.layout import Plane, jittered_apart, slot_centres_m
 from vla_eval.tasks.objects.limits import (
     CubeHalfSize,
     ItemCount,
+    MeshScale,
     MixedColorCount,
     MixedShapeCount,
     Positive,
     ThingCount,
 )
+from vla_eval.tasks.objects.meshes import read_meshes
 from vla_eval.tasks.objects.things import THINGS
 from vla_eval.tasks.tensors_out import Info
 
@@ -137,17 +139,36 @@ class RememberObjectEnv(RememberEnv):
 
     Source: the paper, section "Extending atomic tasks with realistic object distributions", which replaces
     the cubes of RememberColor by randomly sampled objects of YCB. Here they are twelve small things made of
-    primitives (`objects/things.py`), and a task with N has the first N of them.
+    primitives (`objects/things.py`), and a task with N has the first N of them; or meshes of a folder.
 
-    Arguments: `n_items` 2 to 12, and those of `RememberEnv`, `ChoiceEnv` and `MemoryTableEnv`.
+    Arguments: `n_items` 2 to 12, `meshes` (a folder; the first N of its meshes by name, see
+    `objects/meshes.py`), `mesh_scale`, `mesh_holes` (surfaces need not be closed), and those of
+    `RememberEnv`, `ChoiceEnv` and `MemoryTableEnv`.
     """
 
     FAMILY = 12
 
-    def __init__(self, *args: Any, n_items: ThingCount = 3, **kwargs: Any) -> None:
+    def __init__(
+        self,
+        *args: Any,
+        n_items: ThingCount = 3,
+        meshes: str | None = None,
+        mesh_scale: MeshScale = 1.0,
+        mesh_holes: bool = False,
+        **kwargs: Any,
+    ) -> None:
         limits.check(ThingCount, n_items=n_items)
-        items = tuple(Item(thing) for thing in list(THINGS.values())[:n_items])
-        super().__init__(*args, items=items, **kwargs)
+        limits.check(MeshScale, mesh_scale=mesh_scale)
+        limits.check_together(meshes=meshes, mesh_scale=mesh_scale, mesh_holes=mesh_holes)
+        shapes = list(THINGS.values())[:n_items]
+        if meshes is not None:
+            found = read_meshes(meshes, scale=mesh_scale, allow_holes=mesh_holes).candidates(n_items)
+            shapes = [
+                Shape(name=mesh.name, parts=(), rest_height_m=mesh.solid.height_m / 2, solid=mesh.solid)
+                for mesh in found
+            ]
+            self.candidate_names = tuple(mesh.name for mesh in found)
+        super().__init__(*args, items=tuple(map(Item, shapes)), **kwargs)
 
     def _places_m(self, rng: np.random.Generator) -> Plane:
         return jittered_apart(slot_centres_m(self.n_items), rng)

@@ -1,7 +1,8 @@
 """From a recipe to what is recorded of each task; finds mistakes before a simulator is started."""
 
 import io
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import av
@@ -20,14 +21,17 @@ from vla_eval.evaluation.episode_jobs import EpisodeGroup, GroupKey
 from vla_eval.features import EncoderSettings
 from vla_eval.policies.registry import check_adapter
 from vla_eval.rollout import RolloutSettings
+from vla_eval.tasks.arguments import meshes_of, pinned
 from vla_eval.tasks.catalog import robot_task
+from vla_eval.tasks.objects.mesh_folder import without_path
 from vla_eval.tasks.spec import TaskSpec
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingPlan:
-    """What is recorded of each task, and the digests of recipes, prompts and weights."""
+    """What is recorded of each task, and the digests of recipes, prompts, weights and meshes."""
 
+    recipe: DatasetRecipe  # as it may be stored: of a folder of meshes, name and digest
     tasks: tuple[TaskPlan, ...]
     recipe_files: dict[str, str]
 
@@ -38,21 +42,30 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
     expert = load_recipe("policies", recipe.expert, PolicyRecipe)
     check_adapter(expert.value.adapter)
     prompts = load_prompts(recipe.prompt_set)
+    env = pinned(recipe.env)
+    recipe = replace(recipe, env=without_path(env))
+    meshes = meshes_of(env)
     specs = [robot_task(task, does="`record` makes demonstrations of") for task in recipe.tasks]
     return RecordingPlan(
-        tasks=tuple(_task_plan(recipe, expert, spec, sentences_of(prompts, spec)[0]) for spec in specs),
+        recipe=recipe,
+        tasks=tuple(_task_plan(recipe, env, expert, sentences_of(prompts, spec)[0], spec) for spec in specs),
         recipe_files={
             f"policies/{expert.name}": expert.sha256,
             f"prompts/{prompts.name}": prompts.sha256,
             **checkpoint_hashes(expert.value.adapter, expert.value.args, policy=expert.name),
+            **({} if meshes is None else meshes.hashes),
         },
     )
 
 
 def _task_plan(
-    recipe: DatasetRecipe, expert: Recipe[PolicyRecipe], spec: TaskSpec, instruction: str
+    recipe: DatasetRecipe,
+    arguments: Mapping[str, Any],  # Any: plain data
+    expert: Recipe[PolicyRecipe],
+    instruction: str,
+    spec: TaskSpec,
 ) -> TaskPlan:
-    env = EnvSettings(task=spec.id, kwargs=recipe.env, simulator=recipe.simulator, render=recipe.render)
+    env = EnvSettings(task=spec.id, kwargs=arguments, simulator=recipe.simulator, render=recipe.render)
     return TaskPlan(
         group=EpisodeGroup(
             key=GroupKey(spec.id, expert.name, 1),

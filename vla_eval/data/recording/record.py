@@ -155,6 +155,7 @@ def record(
         VlaEvalError: a mistake in the recipe, a recording that cannot resume, a full disk.
     """
     plan = plan_recording(recipe)
+    recipe = plan.recipe
     refuse_missing_gpu(backend.n_gpus, {"render.backend": recipe.render.backend})
     preload = (WORKER_MODULE, *slow_modules(one.group.env for one in plan.tasks))
     if not out.exists():

@@ -43,6 +43,7 @@ from vla_eval.features import CAMERA_KEYS, dataset_features, frame_values
 from vla_eval.robots.find import robot_of
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 from vla_eval.storage.durable import DISK_TROUBLE, storage_full
+from vla_eval.tasks.objects.mesh_folder import without_path
 from vla_eval.workers.inside import Heartbeat
 from vla_eval.workers.messages import DeviceFound
 
@@ -132,7 +133,7 @@ def recorded_episode(plan: TaskPlan, one: Attempt, log: EpisodeLog, *, index: in
         episode_index=index,
         task=plan.task,
         task_version=plan.task_version,
-        env_kwargs=dict(plan.group.env.kwargs),
+        env_kwargs=without_path(plan.group.env.kwargs),
         instruction=start.instruction,
         expert=plan.group.key.policy,
         expert_version=plan.expert_version,

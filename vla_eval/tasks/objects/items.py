@@ -17,6 +17,8 @@ from mani_skill.utils.structs import Actor
 from vla_eval.tasks.objects import limits
 from vla_eval.tasks.objects.item_names import COLOR_RGB
 from vla_eval.tasks.objects.limits import CubeHalfSize
+from vla_eval.tasks.objects.solid_bodies import solid_builder
+from vla_eval.tasks.objects.solids import Solid
 
 S = 0.02  # m, the official scale: half the edge of a cube
 BAR = 0.375 * S
@@ -51,6 +53,7 @@ class Shape:
     name: str
     parts: tuple[Primitive, ...]
     rest_height_m: float
+    solid: Solid | None = None  # a user's mesh, which then is all there is
 
 
 def _about_z(angle_rad: float) -> tuple[float, float, float, float]:
@@ -150,7 +153,9 @@ class Item(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For example `red_cube`, or `banana`."""
+        """For example `red_cube`, or `banana`; a mesh may have the name of anything in the scene."""
+        if self.shape.solid is not None:
+            return f"mesh_{self.shape.name}"
         return f"{self.color.name}_{self.shape.name}" if self.color else self.shape.name
 
     def rgb_of(self, part: Primitive) -> tuple[int, int, int]:
@@ -178,11 +183,14 @@ def build_decoy(scene: ManiSkillScene, item: Item, *, initial_pose: sapien.Pose)
     """Build a kinematic actor that looks like an item and touches nothing."""
     builder = _item_builder(scene, item)
     builder.collision_records = []
+    builder.hulls_m = []  # of a mesh
     builder.initial_pose = initial_pose
     return builder.build_kinematic(name=f"{item.name}_decoy")
 
 
 def _item_builder(scene: ManiSkillScene, item: Item) -> Any:  # ManiSkill is untyped
+    if item.shape.solid is not None:
+        return solid_builder(scene, item.shape.solid)
     builder = scene.create_actor_builder()
     materials = {}  # one for all parts of a colour
     for part in item.shape.parts:

@@ -63,6 +63,7 @@ StepCount = Annotated[int, Limits(0, MAX_STEPS)]
 SomeSteps = Annotated[int, Limits(1, MAX_STEPS)]
 # Neighbours may lie 6 cm apart: larger ones would overlap.
 CubeHalfSize = Annotated[float, Limits(0.01, 0.03)]
+MeshScale = Annotated[float, Limits(0, 1e6, above=True)]  # from nanometres to metres, and the other way
 CarryHeight = Annotated[float, Limits(0, 0.5)]  # 0: need not be lifted; the most is what the arm reaches
 LiftHeight = Annotated[float, Limits(0, 0.4, above=True)]
 
@@ -189,6 +190,12 @@ RULES: tuple[Callable[..., bool | str], ...] = (
         clutter > n_free_places
         and f"clutter={clutter}: expected at most {n_free_places}: no more places of the table are clear of "
         "what this task uses, and in the base camera's view."
+    ),
+    lambda meshes, mesh_scale, mesh_holes: (
+        meshes is None
+        and (mesh_scale != 1 or mesh_holes)
+        and f"mesh_scale={mesh_scale:g}, mesh_holes={mesh_holes} without meshes: expected a folder to which "
+        "they apply. Set env.meshes, or remove them."
     ),
     lambda move_in_delay, control_mode: (
         move_in_delay
