@@ -99,3 +99,10 @@ class Arm:
     chain: Chain | None = None
     # family of tasks -> why the arm does not solve it, in words: it is not offered there
     not_solved: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def added_tool(self) -> Hinge:
+        """The tool centre point of an arm for which ManiSkill's agent has none."""
+        tool = self.tool if self.chain is None else self.chain.tool
+        assert tool is not None, f"{self.name}: the agent has a tool centre point of its own"
+        return tool

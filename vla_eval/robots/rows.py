@@ -1,10 +1,11 @@
 """The robots that ship, a row each."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE, JOINT_DELTA_POS, JOINT_POS, joint_modes
 from vla_eval.robots.arm import Arm, Chain, Gripper, Hinge
-from vla_eval.specs import ActionSpec
 
 # Arm of the official code (mikasa_tasks section 1): tool centre point at (-0.07, 0, 0.318), pointing down.
 PANDA = Arm(
@@ -55,20 +56,47 @@ FETCH = Arm(
 )
 
 
-def _five_joints(joints: tuple[str, ...], chain: Chain) -> dict[str, ActionSpec]:
-    """Return the control modes of an arm with too few joints for every pose of the hand.
-
-    Absolute positions come first, as LeRobot commands these arms.
-    """
-    delta, absolute = joint_modes(joints[:-1], chain.low_rad, chain.high_rad)
-    return {JOINT_POS: absolute, JOINT_DELTA_POS: delta}
-
-
 _BEHIND_THE_MUGS = "the mugs are pushed from behind, and behind the nearest ones the arm itself stands"
 _IN_THE_LANE = dict.fromkeys(
     ("Intercept", "InterceptGrab"), "many balls roll through the place where the arm stands"
 )
 _QUARTER = np.pi / 2
+
+
+def _small_arm(
+    *,
+    name: str,
+    agent: str,
+    description: str,
+    joints: tuple[str, ...],
+    gripper: Gripper,
+    rest_qpos: tuple[float, ...],
+    base_x_m: float,
+    chain: Chain,
+    not_solved: Mapping[str, str],
+) -> Arm:
+    """Return an arm on the table with five joints, too few for every pose of the hand, and one of its jaw.
+
+    Absolute positions come first, as LeRobot commands these arms.
+    """
+    delta, absolute = joint_modes(joints[:-1], chain.low_rad, chain.high_rad)
+    return Arm(
+        name=name,
+        agent=f"vla_eval.tasks.arm.small_arms:{agent}",
+        uids=(f"{name}_at_table",),
+        description=description,
+        joints=joints,
+        arm_joints=tuple(range(5)),
+        gripper=gripper,
+        rest_qpos=rest_qpos,
+        base_m=(base_x_m, 0.0, 0.0),
+        base_yaw_rad=_QUARTER,
+        actions={JOINT_POS: absolute, JOINT_DELTA_POS: delta},
+        chain=chain,
+        not_solved={"ShellGamePush": _BEHIND_THE_MUGS, **_IN_THE_LANE, **not_solved},
+    )
+
+
 _SO100_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
 # Of ManiSkill's `so100.urdf`. The tool centre point is 3 cm in front of the fixed jaw's tip: the jaws then
 # pass a cube of 4 cm and a peg of 5 cm on both sides.
@@ -86,13 +114,11 @@ _SO100_CHAIN = Chain(
     least_reach_m=0.1,
 )
 # So far back that the nearest mugs do not stand on it, and so near that it reaches the farthest.
-SO100 = Arm(
+SO100 = _small_arm(
     name="so100",
-    agent="vla_eval.tasks.arm.small_arms:SO100AtTable",
-    uids=("so100_at_table",),
+    agent="SO100AtTable",
     description="SO-100, LeRobot's arm with five joints and a gripper, on the table",
     joints=_SO100_JOINTS,
-    arm_joints=tuple(range(5)),
     # Up to 5 cm as measured with cubes between the jaws, beyond that the distance of the jaws' tips in the
     # same file less 12 mm.
     gripper=Gripper(
@@ -105,14 +131,10 @@ SO100 = Arm(
         ),
     ),
     rest_qpos=(0.0, -0.8, 0.2, 1.75, _QUARTER, -0.05),
-    base_m=(-0.24, 0.0, 0.0),
-    base_yaw_rad=_QUARTER,
-    actions=_five_joints(_SO100_JOINTS, _SO100_CHAIN),
+    base_x_m=-0.24,
     chain=_SO100_CHAIN,
     not_solved={
-        "ShellGamePush": _BEHIND_THE_MUGS,
         "ShellGamePick": "its jaws, one of which swings, push the mug away instead of closing on the handle",
-        **_IN_THE_LANE,
         **dict.fromkeys(
             ("RotateLenient", "RotateStrict"), "it does not come to rest while its jaws hold the peg"
         ),
@@ -139,13 +161,11 @@ _KOCH_CHAIN = Chain(
     least_reach_m=0.1,
 )
 # So far back that the outermost of nine cubes do not stand beside it.
-KOCH = Arm(
+KOCH = _small_arm(
     name="koch",
-    agent="vla_eval.tasks.arm.small_arms:KochAtTable",
-    uids=("koch_at_table",),
+    agent="KochAtTable",
     description="Koch v1.1, the smaller arm with five joints and a gripper, on the table",
     joints=_KOCH_JOINTS,
-    arm_joints=tuple(range(5)),
     # The distance of the fingers' tips in the same file.
     gripper=Gripper(
         joints=(-1,),
@@ -157,14 +177,10 @@ KOCH = Arm(
         ),
     ),
     rest_qpos=(0.0, 1.35, 0.5, 2.1, _QUARTER, 1.6),
-    base_m=(-0.25, 0.0, 0.0),
-    base_yaw_rad=_QUARTER,
-    actions=_five_joints(_KOCH_JOINTS, _KOCH_CHAIN),
+    base_x_m=-0.25,
     chain=_KOCH_CHAIN,
     not_solved={
-        "ShellGamePush": _BEHIND_THE_MUGS,
         "ShellGamePick": "its fingers, one of which swings, do not close on the handle",
-        **_IN_THE_LANE,
         **dict.fromkeys(("RotateLenient", "RotateStrict"), "its fingers do not get around the peg"),
         "TakeItBack": "its fingers lose the cube on the way",
     },

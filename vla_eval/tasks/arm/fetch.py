@@ -11,9 +11,8 @@ from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.fetch import Fetch
 from mani_skill.sensors.camera import CameraConfig
 
-from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.rows import FETCH
-from vla_eval.tasks.interface import CAMERA_FOV_RAD
+from vla_eval.tasks.arm.hands import hand_camera
 
 HOLDING = 1e5  # N·s/m, N·m·s/rad: a joint with this damping does not move by itself
 
@@ -42,18 +41,7 @@ class FetchAtTable(Fetch):  # type: ignore[misc]  # ManiSkill is untyped
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
         """The wrist camera: on the hand, behind the fingers and above them, looking along them."""
-        return [
-            CameraConfig(
-                uid="hand_camera",
-                pose=sapien.Pose(p=[-0.1, 0, 0.1]),
-                width=IMAGE_SIZE_PX,
-                height=IMAGE_SIZE_PX,
-                fov=CAMERA_FOV_RAD,
-                near=0.01,
-                far=100,
-                mount=self.robot.links_map["gripper_link"],
-            )
-        ]
+        return hand_camera(self.robot.links_map["gripper_link"], sapien.Pose(p=[-0.1, 0, 0.1]))
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:  # Any: ManiSkill's configurations

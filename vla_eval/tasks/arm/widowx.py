@@ -3,20 +3,17 @@
 Its meshes are a download of ManiSkill, which nothing here starts.
 """
 
+from pathlib import Path
 from typing import Any
 
-import sapien
 from mani_skill.agents.controllers import PDEEPoseControllerConfig, PDJointPosMimicControllerConfig
 from mani_skill.agents.registration import register_agent
 from mani_skill.agents.robots.widowx.widowx import WidowX250S
-from mani_skill.sensors.camera import CameraConfig
 
 from vla_eval.control_modes import DELTA_M, DELTA_RAD, EE_DELTA_POSE
-from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.rows import WIDOWX
-from vla_eval.tasks.arm.robots import KeptConfigs, downloaded
-from vla_eval.tasks.arm.small_arms import TOOL_LINK, urdf_with_tool
-from vla_eval.tasks.interface import CAMERA_FOV_RAD
+from vla_eval.tasks.arm.hands import TOOL_LINK, ToolAdded
+from vla_eval.tasks.arm.robots import downloaded
 
 # Of ManiSkill's agent for scenes of BridgeData, `WidowX250SBridgeDatasetFlatTable`.
 STIFFNESS = (1169.79, 730.0, 808.46, 1229.13, 1272.28, 1056.33)
@@ -26,28 +23,16 @@ GRIPPER_STIFFNESS, GRIPPER_DAMPING, GRIPPER_FORCE_LIMIT_N = 1000.0, 200.0, 60.0
 
 
 @register_agent()
-class WidowXAtTable(KeptConfigs, WidowX250S):  # type: ignore[misc]  # ManiSkill is untyped
+class WidowXAtTable(ToolAdded, WidowX250S):  # type: ignore[misc]  # ManiSkill is untyped
     """ManiSkill's WidowX 250 S on the table, with a tool centre point, controllers and a wrist camera."""
 
-    (uid,) = WIDOWX.uids
+    ROW = WIDOWX
+    (uid,) = ROW.uids
+    HAND_LINK, CAMERA_M = "ee_gripper_link", (0.06, 0.0, -0.1)
 
-    @property
-    def urdf_path(self) -> str:
-        """Path of the URDF; created when the first such arm is loaded."""
-        assert WIDOWX.tool is not None
-        original = downloaded(WIDOWX, "widowx/wx250s.urdf")
-        return str(urdf_with_tool(original, link="ee_gripper_link", tool=WIDOWX.tool))
-
-    def _after_loading_articulation(self) -> None:
-        super()._after_loading_articulation()
-        self.tcp = self.robot.links_map[TOOL_LINK]
-
-    @property
-    def _sensor_configs(self) -> list[CameraConfig]:
-        """The wrist camera, beside the fingers, looking along them."""
-        pose = sapien.Pose([0.06, 0, -0.1], [0.70710678, 0, -0.70710678, 0])
-        mount, size = self.robot.links_map[TOOL_LINK], (IMAGE_SIZE_PX, IMAGE_SIZE_PX)
-        return [CameraConfig("hand_camera", pose, *size, CAMERA_FOV_RAD, 0.01, 100, mount=mount)]
+    def original_urdf(self) -> Path:
+        """Return the path of the URDF among ManiSkill's downloads."""
+        return downloaded(WIDOWX, "widowx/wx250s.urdf")
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:  # Any: ManiSkill's configurations

@@ -13,11 +13,10 @@ from mani_skill.agents.robots.xarm6.xarm6_robotiq import XArm6Robotiq
 from mani_skill.sensors.camera import CameraConfig
 
 from vla_eval.control_modes import EE_DELTA_POSE
-from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.rows import XARM6
 from vla_eval.tasks.arm.fetch import StillConfig
+from vla_eval.tasks.arm.hands import ALONG_THE_FINGERS_WXYZ, hand_camera
 from vla_eval.tasks.arm.robots import KeptConfigs, downloaded
-from vla_eval.tasks.interface import CAMERA_FOV_RAD
 
 # 20 N at the pads, which move by 5 cm/rad: the least force of a Robotiq 2F-85 (20 to 235 N, its manual).
 # With the 0.1 N m of ManiSkill's agent the fingers give way while they turn a peg.
@@ -59,9 +58,8 @@ class XArm6AtTable(KeptConfigs, XArm6Robotiq):  # type: ignore[misc]  # ManiSkil
     @property
     def _sensor_configs(self) -> list[CameraConfig]:
         """The wrist camera, beside the gripper, looking along it."""
-        pose = sapien.Pose([0.07, 0, -0.12], [0.70710678, 0, -0.70710678, 0])
-        mount, size = self.robot.links_map[self.ee_link_name], (IMAGE_SIZE_PX, IMAGE_SIZE_PX)
-        return [CameraConfig("hand_camera", pose, *size, CAMERA_FOV_RAD, 0.01, 100, mount=mount)]
+        pose = sapien.Pose([0.07, 0.0, -0.12], ALONG_THE_FINGERS_WXYZ)
+        return hand_camera(self.robot.links_map[self.ee_link_name], pose)
 
     @property
     def _controller_configs(self) -> dict[str, dict[str, Any]]:  # Any: ManiSkill's configurations
