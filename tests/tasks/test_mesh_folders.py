@@ -368,7 +368,18 @@ def test_all_meshes_that_are_wrong_are_named_in_one_message(tmp_path: Path) -> N
     assert all(f"m{index}.stl" in message for index in range(5)) and message.endswith("And 2 more.")
 
 
-@pytest.mark.parametrize("place", ["nowhere", "a_file"])
-def test_a_folder_that_is_none_is_refused(tmp_path: Path, place: str) -> None:
+@pytest.mark.parametrize("text", ["nowhere", "a_file", "", "a\0b", "a" * 5000, "~nobody_of_this_name/meshes"])
+def test_a_folder_that_is_none_is_refused(tmp_path: Path, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     (tmp_path / "a_file").write_text("")
-    assert "expected a folder of meshes" in refusal(tmp_path / place)
+    with pytest.raises(TaskArgumentError, match="expected a folder of meshes") as found:
+        read_meshes(text)
+    assert len(str(found.value)) < 500 and str(found.value).isprintable()
+
+
+def test_what_a_desktop_leaves_in_a_folder_is_no_mesh(tmp_path: Path) -> None:
+    save(box(), tmp_path / "box.stl")
+    (tmp_path / "._box.stl").write_bytes(b"\0\5")
+    (tmp_path / ".DS_Store").write_bytes(b"")
+    found = read_meshes(str(tmp_path))
+    assert [one.name for one in found.meshes] == ["box"] and found.unread == (".DS_Store", "._box.stl")

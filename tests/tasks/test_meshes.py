@@ -93,6 +93,7 @@ def pixels(seed: int, **arguments: Any) -> np.ndarray:
     return image
 
 
+@pytest.mark.slow
 def test_a_thing_exported_as_a_mesh_looks_as_it_did(tmp_path: Path) -> None:
     """As many pixels of the same colour, elsewhere: its origin is in the middle of a circle around it."""
     all_things, folder = folder_of_things(tmp_path / "all"), tmp_path / "three"

@@ -6,6 +6,7 @@ of what is in a file.
 
 import hashlib
 import itertools
+import os
 import re
 import stat
 from collections.abc import Mapping
@@ -65,13 +66,17 @@ class FolderFiles:
     """Reads files of a folder, each once, and remembers the sha256 of each by its path in the folder."""
 
     def __init__(self, text: str) -> None:
-        self.shown = text
-        self.root = Path(text).expanduser().resolve()
-        if not self.root.is_dir():
+        self.shown = f"{text!r:.200}"
+        try:
+            self.root = Path(text).expanduser().resolve()
+            found = "" if text and os.access(self.root, os.R_OK | os.X_OK) else "nothing that can be read"
+            found = found or ("" if self.root.is_dir() else "a file")
+        except (OSError, RuntimeError, ValueError) as exc:  # a long name, no such user's folder, a zero byte
+            found = f"what is no path ({getattr(exc, 'strerror', None) or exc})"
+        if found:
             raise TaskArgumentError(
-                f"{MESHES}={text!r}: expected a folder of meshes ({', '.join(FORMATS)}), found "
-                f"{'a file' if self.root.exists() else 'nothing'} there. Run the command where the "
-                "folder lies, or name it with its whole path."
+                f"{MESHES}={self.shown}: expected a folder of meshes ({', '.join(FORMATS)}), found {found}. "
+                "Run the command where the folder lies, or name it with its whole path."
             )
         self.sha256: dict[str, str] = {}
 
@@ -83,11 +88,12 @@ class FolderFiles:
         """
         found: dict[str, list[PurePosixPath]] = {}
         for entry in sorted(self.root.iterdir()):
-            if entry.suffix.lower() in FORMATS:
+            if entry.suffix.lower() in FORMATS and not entry.name.startswith("."):
                 found.setdefault(entry.stem, []).append(PurePosixPath(entry.name))
         models = self.root / MODELS
         for entry in sorted(models.iterdir()) if models.is_dir() else ():
-            found.setdefault(entry.name, []).append(PurePosixPath(MODELS, entry.name, MODEL_FILE))
+            if entry.is_dir() and not entry.name.startswith("."):
+                found.setdefault(entry.name, []).append(PurePosixPath(MODELS, entry.name, MODEL_FILE))
         for problem in (
             f"no mesh in it ({', '.join(FORMATS)}); it has {self._entries()}" if not found else "",
             f"more than {MAX_MESHES} meshes" if len(found) > MAX_MESHES else "",
@@ -96,7 +102,7 @@ class FolderFiles:
         ):
             if problem:
                 raise TaskArgumentError(
-                    f"{MESHES}={self.shown!r}: found {problem}. Expected one file for each mesh, with a name "
+                    f"{MESHES}={self.shown}: found {problem}. Expected one file for each mesh, with a name "
                     "of up to 64 letters, digits, spaces, '.', '_' and '-'. Change the folder."
                 )
         return {name: files[0] for name, files in sorted(found.items())}
@@ -106,7 +112,7 @@ class FolderFiles:
         entries = list(itertools.islice(self.root.rglob("*"), MAX_FILES + 1))
         if len(entries) > MAX_FILES:
             raise TaskArgumentError(
-                f"{MESHES}={self.shown!r}: expected a folder of meshes alone, found more than {MAX_FILES} "
+                f"{MESHES}={self.shown}: expected a folder of meshes alone, found more than {MAX_FILES} "
                 "files. Copy the meshes into a folder of their own."
             )
         stats = ((entry, entry.lstat()) for entry in entries)

@@ -9,6 +9,7 @@ import io
 import json
 import logging
 import struct
+import warnings
 from collections.abc import Iterator
 from pathlib import PurePosixPath
 from typing import Any  # glTF's JSON; trimesh's materials have no types
@@ -126,7 +127,10 @@ def reading() -> Iterator[None]:
     level = logger.level
     logger.setLevel(logging.CRITICAL)  # what it would warn of is an error here
     try:
-        yield
+        with warnings.catch_warnings():
+            # numpy warns of text that is no row of numbers, which trimesh then reads otherwise, or refuses
+            warnings.simplefilter("ignore", DeprecationWarning)
+            yield
     except UnusableMeshError:
         raise
     except Exception as exc:

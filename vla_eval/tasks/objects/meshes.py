@@ -52,7 +52,7 @@ class MeshSet(NamedTuple):
         if len(self.meshes) < n_items:
             more = f" (not read: {', '.join(self.unread[:6])})" if self.unread else ""
             raise TaskArgumentError(
-                f"{MESHES}={self.asked.folder!r}: expected at least {n_items} meshes, one for each "
+                f"{MESHES}={self.asked.folder!r:.200}: expected at least {n_items} meshes, one for each "
                 f"candidate, found {len(self.meshes)}{more}. Add some, or use a task with fewer candidates."
             )
         return self.meshes[:n_items]
@@ -75,8 +75,8 @@ def read_meshes(text: str, *, scale: float = 1.0, allow_holes: bool = False) -> 
     found = _read(wanted.folder, scale, allow_holes, FolderFiles(wanted.folder).stamps())
     if wanted.digest not in (None, found.asked.digest):
         raise TaskArgumentError(
-            f"{MESHES}: expected the files of {wanted}, found others in {wanted.folder} ({found.asked}). "
-            "Restore them, or name the folder without '@' and its digest, in a new run."
+            f"{MESHES}: expected the files of {wanted}, found others in {wanted.folder!r:.200} "
+            f"({found.asked}). Restore them, or name the folder without '@' and its digest, in a new run."
         )
     return found
 
@@ -99,5 +99,5 @@ def _read(folder: str, scale: float, allow_holes: bool, _stamps: tuple[Stamp, ..
             meshes.append(Mesh(name, solid))
     if wrong:
         more = f" And {len(wrong) - MAX_SHOWN} more." if len(wrong) > MAX_SHOWN else ""
-        raise TaskArgumentError(f"{MESHES}={folder!r}: {' '.join(wrong[:MAX_SHOWN])}{more}")
+        raise TaskArgumentError(f"{MESHES}={files.shown}: {' '.join(wrong[:MAX_SHOWN])}{more}")
     return MeshSet(Asked(folder, files.digest), tuple(meshes), dict(files.sha256), files.unread)
