@@ -5,10 +5,12 @@ Nothing is repaired, scaled or turned. Knows nothing of files.
 
 import hashlib
 import math
+from collections.abc import Callable
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
 from vla_eval.tasks.objects.layout import MIXED_MIN_DISTANCE_M
 from vla_eval.tasks.objects.mesh_folder import UnusableMeshError
@@ -25,6 +27,8 @@ TILTS_RAD = np.deg2rad(np.arange(2, 61, 2))
 # Of the centre of mass, as a thing is tilted: a ball of flat triangles never drops by as much, and what
 # stands rises by more before it falls.
 MAX_DROP_M, LEAST_RISE_M = 0.0005, 0.0001
+# Rows (N, D) -> the index of one of each kind, and of each row's among these. trimesh has no types for it.
+_unique_rows: Callable[..., tuple[NDArray[np.int64], NDArray[np.int64]]] = trimesh.grouping.unique_rows
 
 
 def solid_of(surfaces: list[Surface], *, allow_holes: bool) -> Solid:
@@ -35,6 +39,8 @@ def solid_of(surfaces: list[Surface], *, allow_holes: bool) -> Solid:
     """
     corners = np.concatenate([one.vertices_m[one.triangles.ravel()] for one in surfaces]).astype(np.float64)
     least, most = corners.min(axis=0), corners.max(axis=0)
+    if (most - least).min() == 0:
+        raise UnusableMeshError("it is flat, expected a body. Thicken it")
     middle = np.append(_round_centre(corners[:, :2]), (least[2] + most[2]) / 2)
     _check_size(corners - middle, most - least)
     n_open = _open_edges(corners)
@@ -58,7 +64,7 @@ def _round_centre(points: NDArray[np.float64]) -> NDArray[np.float64]:
     From the middle of the bounding box, it moves towards the farthest point by less and less.
     Source: Badoiu, Clarkson, "Smaller core-sets for balls", 2003, section 3.
     """
-    points = np.unique(points, axis=0)
+    points = points[ConvexHull(points).vertices]
     centre = best = (points.min(axis=0) + points.max(axis=0)) / 2
     least = np.hypot(*(points - centre).T).max()
     for step in range(1, N_CENTRE_STEPS):
@@ -106,11 +112,11 @@ def _floor(number: float) -> float:
 
 def _open_edges(corners: NDArray[np.float64]) -> int:
     """Return how many edges are not shared by two triangles; corners at one place are one corner."""
-    _, index = np.unique(np.round(corners, 7), axis=0, return_inverse=True)
+    _, index = _unique_rows(corners, digits=7)
     triangles = index.reshape(-1, 3)
     edges = np.sort(np.concatenate((triangles[:, :2], triangles[:, 1:], triangles[:, ::2])), axis=1)
     edges = edges[edges[:, 0] != edges[:, 1]]  # of triangles without an area
-    _, counts = np.unique(edges, axis=0, return_counts=True)
+    _, counts = np.unique(edges[:, 0] * len(corners) + edges[:, 1], return_counts=True)
     return int((counts % 2).sum())
 
 
@@ -148,7 +154,9 @@ def looks(solid: Solid) -> bytes:
         corners = one.vertices_m[one.triangles].astype(np.float64)  # (T, 3, 3)
         sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         area_mm2 = round(float(np.linalg.norm(sides, axis=1).sum() / 2 * 1e6), 2)
-        places = np.unique(np.round(corners.reshape(-1, 3), 6) + 0.0, axis=0)  # + 0.0: no negative zero
+        places = np.round(corners.reshape(-1, 3), 6) + 0.0  # no negative zero
+        places = places[_unique_rows(places, digits=6)[0]]
+        places = places[np.lexsort(places.T)]
         digest.update(f"{len(places)} {area_mm2} {one.rgb}".encode() + places.tobytes())
         digest.update(b"" if one.texture is None else one.texture.tobytes())
     return digest.digest()
