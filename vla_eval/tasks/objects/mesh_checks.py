@@ -41,7 +41,8 @@ def solid_of(surfaces: list[Surface], *, allow_holes: bool) -> Solid:
     least, most = corners.min(axis=0), corners.max(axis=0)
     if (most - least).min() == 0:
         raise UnusableMeshError("it is flat, expected a body. Thicken it")
-    middle = np.append(_round_centre(corners[:, :2]), (least[2] + most[2]) / 2)
+    with reading():
+        middle = np.append(_round_centre(corners[:, :2]), (least[2] + most[2]) / 2)
     _check_size(corners - middle, most - least)
     n_open = _open_edges(corners)
     if n_open and not allow_holes:

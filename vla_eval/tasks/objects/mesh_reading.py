@@ -6,9 +6,7 @@ it is an error. Knows nothing of what a task can use.
 
 import contextlib
 import io
-import json
 import logging
-import struct
 import warnings
 from collections.abc import Iterator
 from pathlib import PurePosixPath
@@ -22,12 +20,12 @@ from PIL import Image
 from trimesh.resolvers import Resolver
 
 from vla_eval.tasks.objects.mesh_folder import FolderFiles, UnusableMeshError
+from vla_eval.tasks.objects.mesh_gltf import check_gltf, gltf_header, n_textured
 from vla_eval.tasks.objects.solids import RGB, Surface
 
 MAX_TRIANGLES = 100_000
 MAX_TEXTURE_PX = 4096
 MAX_PLACE_M = 1e6
-MAX_GLTF_PARTS, MAX_GLTF_NUMBERS = 1_000, 10_000_000  # nodes and meshes; numbers of its accessors
 PLAIN_RGB = (150, 150, 150)  # of a mesh without a material
 Y_UP = np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]])
 """From the axes of glTF, whose specification has y up (2.0, section 3.4), to z up."""
@@ -41,10 +39,11 @@ def read_surfaces(files: FolderFiles, file: PurePosixPath, *, scale: float) -> l
     """
     content, kind = files.content(file), file.suffix.lower().removeprefix(".")
     resolver = _OfFolder(files, file.parent, names_images=kind == "obj")
-    is_gltf = kind in ("glb", "gltf")
-    if is_gltf:
-        _check_gltf(content)
+    header: dict[str, Any] | None = None
     with reading():
+        if kind in ("glb", "gltf"):
+            header = gltf_header(content)
+            check_gltf(header)
         scene = trimesh.load_scene(io.BytesIO(content), file_type=kind, resolver=resolver, process=False)
         found = scene.dump(concatenate=False)
     if resolver.problem is not None:
@@ -60,9 +59,11 @@ def read_surfaces(files: FolderFiles, file: PurePosixPath, *, scale: float) -> l
             f"it has {n_triangles} triangles, expected at most {MAX_TRIANGLES}. Simplify it"
         )
     with reading():
-        surfaces = [_surface(part, turn=Y_UP if is_gltf else np.eye(3), scale=scale) for part in parts]
-    if is_gltf:
-        _check_textures(content, surfaces)
+        turn = np.eye(3) if header is None else Y_UP
+        surfaces = [_surface(part, turn=turn, scale=scale) for part in parts]
+        n_wanted = 0 if header is None else n_textured(header)
+    if sum(one.texture is not None for one in surfaces) < n_wanted:  # trimesh hides what it cannot read
+        raise UnusableMeshError("a texture of it cannot be read; expected PNG or JPEG. Export it again")
     return surfaces
 
 
@@ -138,36 +139,6 @@ def reading() -> Iterator[None]:
         raise UnusableMeshError(f"it cannot be read as a mesh ({reason:.120}). Export it again") from exc
     finally:
         logger.setLevel(level)
-
-
-def _gltf_header(content: bytes) -> dict[str, Any]:
-    """Return the JSON of a glTF file, binary or not."""
-    if content[:4] == b"glTF":
-        (n_bytes,) = struct.unpack("<I", content[12:16])
-        content = content[20 : 20 + n_bytes]
-    header = json.loads(content)
-    if not isinstance(header, dict):
-        raise UnusableMeshError("it is no glTF: its JSON is not an object. Export it again")
-    return header
-
-
-def _check_gltf(content: bytes) -> None:
-    """Refuse a small file that asks for very much memory."""
-    with reading():
-        header = _gltf_header(content)
-        n_parts = sum(len(header.get(name, ())) for name in ("nodes", "meshes"))
-        n_children = sum(len(node.get("children", ())) for node in header.get("nodes", ()))
-        counts = [accessor["count"] for accessor in header.get("accessors", ())]
-        if max(n_parts, n_children) > MAX_GLTF_PARTS or sum(counts) > MAX_GLTF_NUMBERS:
-            raise UnusableMeshError("it has more parts or numbers than a thing on a table needs. Simplify it")
-
-
-def _check_textures(content: bytes, surfaces: list[Surface]) -> None:
-    """Refuse a file whose textures trimesh has left out: it says nothing of images that it cannot read."""
-    materials = _gltf_header(content).get("materials", ())
-    textured = any("baseColorTexture" in one.get("pbrMetallicRoughness", {}) for one in materials)
-    if textured and not any(one.texture is not None for one in surfaces):
-        raise UnusableMeshError("its texture cannot be read; expected PNG or JPEG. Export it again")
 
 
 def _surface(part: trimesh.Trimesh, *, turn: NDArray[np.float64], scale: float) -> Surface:
