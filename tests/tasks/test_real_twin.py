@@ -1,7 +1,9 @@
 """The stages on a real arm, simulated: what is seen when, and what counts."""
 
+import importlib
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -17,6 +19,7 @@ from vla_eval.records import EpisodeRecord
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.tasks.memory_env import PARK_X_M
 from vla_eval.tasks.real_stages import COLORS, STAGES, Stage, stage_of
+from vla_eval.tasks.real_twin import drawn
 from vla_eval.testing import check_task
 
 SEED = 3
@@ -90,3 +93,22 @@ def test_to_lift_a_wrong_cube_is_a_choice_and_no_success() -> None:
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
 def test_they_keep_the_contract_of_a_task(stage: Stage) -> None:
     check_task(stage.twin_id)
+
+
+@pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.name)
+def test_a_stage_has_an_id_in_gymnasium(stage: Stage) -> None:
+    importlib.import_module("vla_eval.tasks.register")
+    assert gymnasium.registry[stage.twin_id].kwargs == {"task": stage.twin_id}
+    assert f"real_twin_maniskill/{stage.name}-v0" in gymnasium.registry
+
+
+def test_gymnasium_makes_a_stage_with_the_arm_that_is_asked_for() -> None:
+    importlib.import_module("vla_eval.tasks.register")
+    env: Any = gymnasium.make("real_twin/CubeVisible-v0", robot="so100", cameras=["base_camera"])
+    observation, info = env.reset(seed=3)
+    color, _ = drawn(3)
+    assert info["instruction"] == f"Pick the {COLORS[color]} cube"
+    assert observation["state"]["qpos"].shape == (6,)
+    _, _, terminated, truncated, info = env.step(env.unwrapped.hold_action())
+    assert (terminated, truncated, info["phase"]) == (False, False, "response")
+    env.close()

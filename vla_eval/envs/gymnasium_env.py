@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from vla_eval.config.environment import EnvSettings, RenderSettings, Simulator, WristMesh
 from vla_eval.config.prompts import DEFAULT_PROMPT_SET, instruction_for
-from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE
+from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import EpisodeStart, FloatArray, SimEnv, StepResult
 from vla_eval.envs.factory import describe_env
 from vla_eval.envs.factory import make_env as make_sim_env
 from vla_eval.errors import InvalidActionError, TaskArgumentError, check_names
 from vla_eval.features import FPS, IMAGE_SIZE_PX
+from vla_eval.robots.find import control_mode_of
 from vla_eval.strict.calls import public
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.interface import CAMERA_NAMES, IMAGE_SIZE
@@ -168,7 +169,7 @@ class TaskEnv(gym.Env[dict[str, Any], NDArray[Any]]):
 def make_env(
     task: str,
     *,
-    control_mode: str = EE_DELTA_POSE,
+    control_mode: str | None = None,
     image_size: int = IMAGE_SIZE_PX,
     cameras: Sequence[str] = CAMERA_NAMES,
     prompt_set: str = DEFAULT_PROMPT_SET,
@@ -182,7 +183,7 @@ def make_env(
 
     Args:
         task: task id, a family with the arguments that it asks for, or a task of an installed package.
-        control_mode: what an action means.
+        control_mode: what an action means; None: the first mode of the robot.
         image_size: height and width of images.
         cameras: which images an observation has; none: no renderer is started.
         prompt_set: where the instruction comes from.
@@ -199,9 +200,10 @@ def make_env(
     row = task_spec(task)
     _refuse_maniskill(row, {**env, "render_backend": render_backend})
     check_names("camera", cameras, CAMERA_NAMES, where=row.id)
+    mode = control_mode_of(env) if control_mode is None else control_mode
     settings = EnvSettings(
         task=row.id,
-        kwargs={**env, CONTROL_MODE: control_mode, IMAGE_SIZE: image_size},
+        kwargs={**env, CONTROL_MODE: mode, IMAGE_SIZE: image_size},
         simulator=simulator,
         render=render_settings(wrist_mesh, render_backend),
         cameras=tuple(cameras),

@@ -1,7 +1,8 @@
-"""Register every task of the catalogue with Gymnasium, as `vla_eval/<id>` and `vla_eval_maniskill/<id>`.
+"""Register our simulated tasks with Gymnasium, as `vla_eval/<id>` and `vla_eval_maniskill/<id>`.
 
 `import vla_eval.tasks.register`, then `gymnasium.make("vla_eval/RememberColor3-v0")` runs one episode at a
-time, in numpy, as an evaluation does; `vla_eval_maniskill/…` is ManiSkill's environment: batched, torch.
+time, in numpy, as an evaluation does; `vla_eval_maniskill/…` is ManiSkill's environment: batched, torch. Of a
+suite with a namespace of its own they are `real_twin/…` and `real_twin_maniskill/…`.
 """
 
 import functools
@@ -14,7 +15,7 @@ from mani_skill.utils import registration
 
 from vla_eval.config.prompts import instruction_for
 from vla_eval.errors import MissingDependencyError
-from vla_eval.tasks.catalog import TASKS
+from vla_eval.tasks.catalog import SUITES, TASKS
 from vla_eval.tasks.spec import TaskSpec
 
 MAKE = "vla_eval.envs.gymnasium_env:make_env"
@@ -29,7 +30,7 @@ def env_class(spec: TaskSpec) -> Any:  # a ManiSkill class; ManiSkill is untyped
 
 def register_all() -> None:
     """Register what is not registered yet."""
-    for spec in TASKS.values():
+    for spec in (*TASKS.values(), *SUITES["real_twin"].values()):
         if spec.maniskill_id not in registration.REGISTERED_ENVS:
             gym.register(spec.gym_id, entry_point=MAKE, kwargs={"task": spec.id})
             kwargs = {key: list(v) if isinstance(v, tuple) else v for key, v in spec.kwargs.items()}

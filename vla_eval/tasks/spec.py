@@ -43,7 +43,8 @@ MAX_CANDIDATES = 100
 class TaskSpec:
     """One row of the catalogue."""
 
-    id: str  # task id without namespace, `RememberColor3-v0`; the gym id is `vla_eval/<id>`
+    # task id: `RememberColor3-v0`, whose gym id is `vla_eval/<id>`; or with the namespace of its suite
+    id: str
     version: int = 1  # raised when a change affects a success rate; recorded with each run
     entry_point: str  # `module:Class` of the ManiSkill environment
     # arguments that make this row of its family; a user's arguments override them
@@ -96,12 +97,13 @@ class TaskSpec:
     @property
     def gym_id(self) -> str:
         """The id under which Gymnasium knows the task: one episode in numpy, as an evaluation has it."""
-        return f"vla_eval/{self.id}"
+        return self.id if "/" in self.id else f"vla_eval/{self.id}"
 
     @property
     def maniskill_id(self) -> str:
         """The id of the ManiSkill environment behind it: batched, torch."""
-        return f"vla_eval_maniskill/{self.id}"
+        namespace, _, name = self.gym_id.partition("/")
+        return f"{namespace}_maniskill/{name}"
 
     def make_vec(self, *, n_envs: int) -> str:
         """Return the call that makes several environments on a CPU, for messages."""
