@@ -8,6 +8,7 @@ Source: https://github.com/haosulab/ManiSkill/blob/628bbe64e2c925d9d543171361a86
 
 from collections.abc import Mapping
 from types import MappingProxyType
+from typing import Final
 
 import numpy as np
 
@@ -20,6 +21,10 @@ EE_DELTA_POSE = "pd_ee_delta_pose"
 """The mode of an environment with the Panda for which none is named."""
 EE_DELTA_POS, EE_POSE = "pd_ee_delta_pos", "pd_ee_pose"
 JOINT_DELTA_POS, JOINT_POS = "pd_joint_delta_pos", "pd_joint_pos"
+MOTORS: Final = "motors"
+"""A real arm's own numbers, as LeRobot has them; no simulator executes them. Also the state that they are."""
+POSITION = ".pos"
+"""LeRobot's ending of the name of a motor's position."""
 ABSOLUTE_MODES = (JOINT_POS, EE_POSE)
 """Their actions are where the arm is to be, not how far it is to move."""
 

@@ -10,11 +10,12 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 
-from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE
-from vla_eval.core import FloatArray, StepResult
+from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POSE, MOTORS
+from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.errors import SpecMismatchError
 from vla_eval.robots.arm import Arm
 from vla_eval.robots.rows import PANDA
+from vla_eval.specs import EnvSpec
 from vla_eval.strict.bounds import Bounds, Steps, check_bounds
 
 MAX_CRF = 63  # of AV1; H.264 takes up to 51
@@ -22,6 +23,7 @@ FPS = 20  # control steps per second; every frame is one control step
 
 CAMERA_KEYS = {"base_camera": "observation.images.base", "hand_camera": "observation.images.wrist"}
 """Camera of the environment -> field of the dataset."""
+CAMERA_PREFIX = "observation.images."  # LeRobot's, of any camera
 IMAGE_SIZE_PX = 128  # height and width of images for which nothing else is said
 IMAGE_SHAPE = (IMAGE_SIZE_PX, IMAGE_SIZE_PX, 3)  # height, width, channels
 
@@ -38,6 +40,12 @@ PROPRIO_KEYS: dict[StateKind, str] = {"eef": "proprio.eef", "joints": "proprio.j
 """Both kinds are always stored. lerobot takes as inputs only what begins with `observation`."""
 PROPRIO_STATES = ("tcp_pose", "qpos", "qvel")
 """States of the environment that both are computed from; `joints` is all of them, one after the other."""
+
+
+def camera_key(camera: str) -> str:
+    """Return the field of a camera: of the table, else as LeRobot names it."""
+    return CAMERA_KEYS.get(camera, f"{CAMERA_PREFIX}{camera}")
+
 
 POSE_NAMES = ("x", "y", "z", "qw", "qx", "qy", "qz")
 JOINT_NAMES = PANDA.joints  # of the default robot, as all that names no other
@@ -89,10 +97,8 @@ def dataset_features(
     def scalar(dtype: str, name: str) -> dict[str, Any]:  # Any: as above
         return {"dtype": dtype, "shape": (1,), "names": [name]}
 
-    shape = (image_size_px, image_size_px, 3)
-    image = {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
     return {
-        **{key: dict(image) for key in CAMERA_KEYS.values()},
+        **{key: _video(image_size_px, image_size_px) for key in CAMERA_KEYS.values()},
         STATE_KEY: vector(names[state]),
         ACTION_KEY: vector(action_names),
         **{key: vector(names[kind]) for kind, key in PROPRIO_KEYS.items()},
@@ -100,6 +106,39 @@ def dataset_features(
         SUCCESS_KEY: scalar("bool", "success"),
         DONE_KEY: scalar("bool", "done"),
     }
+
+
+def arm_features(env: EnvSpec) -> dict[str, dict[str, Any]]:  # Any: lerobot's plain data
+    """Return the fields of demonstrations on an arm that LeRobot drives: its motors, and all its cameras."""
+    motors = {"dtype": "float32", "shape": (len(env.action.dims),), "names": list(env.action.dims)}
+    flags = {SUCCESS_KEY: "success", DONE_KEY: "done"}
+    return {
+        **{camera_key(one.name): _video(one.height_px, one.width_px) for one in env.cameras},
+        STATE_KEY: motors,
+        ACTION_KEY: dict(motors),
+        **{key: {"dtype": "bool", "shape": (1,), "names": [name]} for key, name in flags.items()},
+    }
+
+
+def arm_frame(
+    before: Observation, *, action: FloatArray, is_success: bool, is_last: bool
+) -> dict[str, Any]:  # Any: arrays of several types
+    """Return one frame of such a demonstration, as `LeRobotDataset.add_frame` takes it, without the task.
+
+    `action` (M,) is where the motors were sent, and `is_success` whether the success rule holds after it.
+    """
+    return {
+        **{camera_key(camera): image for camera, image in before.images.items()},
+        STATE_KEY: before.state[MOTORS],
+        ACTION_KEY: action.astype(np.float32),
+        SUCCESS_KEY: np.array([is_success]),
+        DONE_KEY: np.array([is_last]),
+    }
+
+
+def _video(height_px: int, width_px: int) -> dict[str, Any]:  # Any: lerobot's plain data
+    shape = (height_px, width_px, 3)
+    return {"dtype": "video", "shape": shape, "names": ["height", "width", "channels"]}
 
 
 def proprioception(state: Mapping[str, FloatArray], arm: Arm = PANDA) -> dict[StateKind, FloatArray]:

@@ -35,12 +35,13 @@ from vla_eval.data.manifest import (
     RecordedEpisode,
     ReplayReport,
     encode_actions,
+    read_entries,
     read_failed,
     read_manifest,
     read_replay,
     to_json,
 )
-from vla_eval.data.recording.shard_writer import SHARD_EPISODES, shard_episodes
+from vla_eval.data.recording.shard_writer import SHARD_EPISODES
 
 EMPTY = FileDigest(n_bytes=0, sha256="e3b0c44298fc1c149afbf4c8996fb92427ae41e4649b934ca495991b7852b855")
 EPISODE = RecordedEpisode(
@@ -193,7 +194,7 @@ def test_a_line_separator_within_a_sentence_ends_no_line(root: Path) -> None:
 
 def test_a_shard_with_such_a_sentence_is_read(root: Path) -> None:
     (root / SHARD_EPISODES).write_text(to_json(EPISODE) + "\n")
-    assert shard_episodes(root) == (EPISODE,)
+    assert read_entries(root / SHARD_EPISODES, RecordedEpisode) == (EPISODE,)
 
 
 @pytest.mark.sampled(3)

@@ -132,6 +132,12 @@ def training_sentences(adapter: str, args: Mapping[str, Any]) -> dict[str, tuple
     return None if facts is None else facts.sentences
 
 
+def trained_control_mode(adapter: str, args: Mapping[str, Any]) -> str | None:
+    """Return what the actions of a policy were for in training; None where that is not known."""
+    facts = _facts(adapter, args)
+    return None if facts is None else facts.control_mode
+
+
 def _facts(adapter: str, args: Mapping[str, Any]) -> TrainingFacts | None:
     folder = checkpoint_folder(adapter, args)
     return None if folder is None else read_facts(folder)

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from vla_eval.cli.shared.arguments import add_flags, seeds_argument, task_argument
+from vla_eval.control_modes import MOTORS
 from vla_eval.errors import DatasetError, RecipeError
 
 if TYPE_CHECKING:
@@ -230,7 +231,8 @@ def _adopt(args: argparse.Namespace) -> int:
         f"{args.dataset}: {len(facts.episodes)} episodes, {facts.n_frames} frames, for {facts.control_mode}"
     )
     _print_sentences(facts)
-    print("Seeds and phases are lost: it cannot be replayed. `finetune` asks for --allow-unreplayed.")
+    if facts.control_mode != MOTORS:
+        print("Seeds and phases are lost: it cannot be replayed. `finetune` asks for --allow-unreplayed.")
     return 0
 
 

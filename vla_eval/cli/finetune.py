@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import re
 import sys
+from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,10 +23,13 @@ from vla_eval.cli.shared.arguments import (
 )
 from vla_eval.config.files import apply_overrides
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe
+from vla_eval.config.real_robot import SIMULATED_TYPE
+from vla_eval.control_modes import MOTORS
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.model_table import is_model_table
 from vla_eval.storage.folders import check_writable
 from vla_eval.strict.decoding import set_field
+from vla_eval.tasks.real_stages import TWIN
 
 if TYPE_CHECKING:
     from vla_eval.cli.terminal.progress import StopRequest
@@ -154,8 +158,17 @@ def _done(summary: "FinetuneSummary") -> int:
     print(summary.checkpoint, flush=True)
     facts = read_facts(summary.checkpoint)
     tasks = [facts.task] if facts is not None and facts.task else list(facts.tasks if facts else ())
+    if facts is not None and facts.control_mode == MOTORS:
+        hint_next("real", "--robot", _robot_of(tasks), "--policy", summary.out)
+        return 0
     hint_next("eval", "--task", *(tasks or ["TASK"]), "--policy", summary.out, "cue_blind", "oracle")
     return 0
+
+
+def _robot_of(tasks: Sequence[str]) -> str:
+    """Return the arm on which demonstrations of these tasks were recorded, as far as it is known."""
+    is_twin = bool(tasks) and all(task.startswith(TWIN) for task in tasks)
+    return SIMULATED_TYPE if is_twin else "FILE.yaml"
 
 
 def _policy_paths() -> dict[str, list[str]]:

@@ -2,22 +2,34 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from typing import TYPE_CHECKING, Any
 
 from vla_eval.cli.shared.arguments import EXIT_EPISODE_ERRORS, MANY, add_flags, typed_command
-from vla_eval.config.real_robot import RobotSettings, load_robot
-from vla_eval.errors import RecipeError, check_names
-from vla_eval.tasks.real_stages import EPISODES_PER_COLOR, STAGES, stage_of
+from vla_eval.cli.shared.arm import (
+    KEYS,
+    LEROBOT,
+    SCRIPTED,
+    Connecting,
+    connected,
+    fault_names,
+    led,
+    named_faults,
+    named_leader,
+    named_robot,
+    say,
+)
+from vla_eval.errors import RecipeError
+from vla_eval.tasks.real_stages import DEMONSTRATIONS_PER_COLOR, EPISODES_PER_COLOR, STAGES, stage_of
 
 if TYPE_CHECKING:
-    from vla_eval.envs.robot.operators import Operator
-    from vla_eval.envs.robot.robot_env import Station
+    from vla_eval.cli.terminal.progress import StopRequest
+    from vla_eval.real.demonstrations import Demonstrations
     from vla_eval.real.evaluation import RealEvaluation
+    from vla_eval.real.recording import RecordedStages
     from vla_eval.real.session import SessionSummary
 
-DESCRIPTION = """Run the paper's three stages on a robot arm, and print their table (docs/real_robot.md).
+DESCRIPTION = """Run the paper's three stages on a robot arm, and print their table (docs/real_robot.md);
+`real record` records demonstrations of them instead, one LeRobotDataset per stage: OUT/TASK.
 
 ROBOT is a YAML file with LeRobot's fields of the arm and the limits of its motion, or simulated_so100, with
 a scripted operator. The order of stages, colours and policies is random, and which policy moves the arm is
@@ -25,23 +37,43 @@ hidden from the operator. The same command again resumes at the next episode, an
 that ended in an error (a cable, a camera, a key that was let go)."""
 EPILOG = """exit codes: 0 every episode has a result; 1 a mistake, or a fault that ended the session (see the
 message); 3 some episodes ended in an error; 130, 143 stopped by Ctrl-C, SIGTERM."""
-KEYS, SCRIPTED = "keys", "scripted"
+MAY_IT_MOVE = "Is all of this right, is the arm free, and may it move?"
+EVALUATE, RECORD = "evaluate", "record"
+FLAGS_OF = {EVALUATE: ("policies", "n_action_steps", "capture_video", "paper"), RECORD: ("teleop", "keep")}
+"""Arguments that the other of the two does not take."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Declare the arguments."""
     parser.description, parser.epilog = DESCRIPTION, EPILOG
+    parser.add_argument(
+        "what",
+        nargs="?",
+        choices=(EVALUATE, RECORD),
+        default=EVALUATE,
+        metavar="evaluate|record",
+        help="what is done on the arm (evaluate)",
+    )
     parser.add_argument("--robot", metavar="ROBOT", help="FILE.yaml, or simulated_so100")
     add_flags(
         parser,
         policy="names in policies/, checkpoints or ws://HOST:PORT; NAME:real_twin/STAGE-v0=DIR, several: one "
         "per stage",
-        episodes=f"episodes per stage, colour and policy ({EPISODES_PER_COLOR})",
+        episodes=f"per stage and colour: episodes of each policy ({EPISODES_PER_COLOR}), or demonstrations "
+        f"({DEMONSTRATIONS_PER_COLOR})",
     )
     parser.add_argument(
         "--operator",
         choices=(KEYS, SCRIPTED),
         help="who sets the table and marks: you, by keys; or a script (simulated_so100)",
+    )
+    parser.add_argument(
+        "--teleop",
+        choices=(LEROBOT, SCRIPTED),
+        help="record: what leads the arm: `teleop` of the arm's file; or a script (simulated_so100)",
+    )
+    parser.add_argument(
+        "--keep", choices=("successes", "all"), help="record: which episodes are kept (successes)"
     )
     names = [stage.name for stage in STAGES]
     parser.add_argument(
@@ -60,32 +92,44 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         **MANY,
         default=[],
         metavar="FAULT@N",
-        help="on simulated_so100: a fault in episode N: cable, power, camera, key, away",
+        help=f"on simulated_so100: a fault in episode N: {', '.join(fault_names())}",
     )
     add_flags(
         parser,
         "--allow-environment-change",
-        out="run folder (runs/real-FINGERPRINT)",
+        out="run folder (runs/real-FINGERPRINT), or folder of the datasets (data/real-FINGERPRINT)",
         dry_run="read the arm and ask the policies once; command nothing",
     )
-    parser.set_defaults(episodes=EPISODES_PER_COLOR)
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the session, then print the table to standard output; everything else goes to standard error."""
+    """Run the session, then print its result to standard output; the rest goes to standard error."""
     from vla_eval.cli.terminal.progress import stop_on_signals
-    from vla_eval.storage.run_folder import read_run
 
-    evaluation = _evaluation(args)
-    faults = _faults(args.rehearse, evaluation.robot, n_episodes=len(evaluation.plan))
+    for other, names in FLAGS_OF.items():
+        given = [name for name in names if getattr(args, name)]
+        if other != args.what and given:
+            flag = {"policies": "policy"}.get(given[0], given[0]).replace("_", "-")
+            raise RecipeError(
+                f"--{flag} is for `mikasa-vla real {other}`, found `{args.what}`. Leave it out."
+            )
     with stop_on_signals() as stop:
         try:
-            summary = _session(evaluation, args, faults, stops=lambda: stop.is_asked)
+            return _record(args, stop) if args.what == RECORD else _evaluate(args, stop)
         except KeyboardInterrupt:
             if not stop.is_asked:
                 raise
             print(f"Stopped. To resume: {typed_command()}", file=sys.stderr)
             return stop.exit_code
+
+
+def _evaluate(args: argparse.Namespace, stop: "StopRequest") -> int:
+    from vla_eval.storage.run_folder import read_run
+
+    evaluation = _evaluation(args)
+    faults = named_faults(args.rehearse, evaluation.robot, n_episodes=len(evaluation.plan))
+    asked = Connecting(settings=evaluation.robot, faults=faults, stops=lambda: stop.is_asked)
+    summary = _session(evaluation, args, asked)
     if summary is None:
         return 0
     if summary.n_open:
@@ -119,13 +163,7 @@ def _evaluation(args: argparse.Namespace) -> "RealEvaluation":
                 f"Name an arm and at least one policy; {flag} is missing. Example: mikasa-vla real --robot "
                 "simulated_so100 --policy oracle"
             )
-    robot = load_robot(args.robot)
-    operator = args.operator or (SCRIPTED if robot.is_simulated else KEYS)
-    if (operator == SCRIPTED) != robot.is_simulated:
-        raise RecipeError(
-            f"--operator {operator}: a script sets the table of the simulated arm (--robot simulated_so100), "
-            "and a person that of a real one. Leave --operator out."
-        )
+    robot = named_robot(args.robot, args.operator)
     stages = tuple(dict.fromkeys(map(stage_of, args.stages)))
     from vla_eval.policies.entries import load_policy_entries
     from vla_eval.real.evaluation import RealEvaluation
@@ -134,106 +172,96 @@ def _evaluation(args: argparse.Namespace) -> "RealEvaluation":
         robot=robot,
         policies=load_policy_entries(args.policies),
         stages=stages,
-        episodes=args.episodes,
+        episodes=EPISODES_PER_COLOR if args.episodes is None else args.episodes,
         seed=args.plan_seed,
         n_action_steps=args.n_action_steps,
         named_out=args.out,
     )
 
 
-def _faults(texts: list[str], robot: RobotSettings, *, n_episodes: int) -> dict[int, str]:
-    """Return number of an episode -> fault."""
-    if texts and not robot.is_simulated:
-        raise RecipeError("--rehearse: expected --robot simulated_so100: a real arm has faults of its own.")
-    found = {}
-    for text in texts:
-        kind, _, number = text.partition("@")
-        check_names("fault", [kind], _fault_names(), where="--rehearse")
-        if not (number.isascii() and number.isdigit() and 1 <= int(number) <= n_episodes):
-            raise RecipeError(
-                f"--rehearse {text:.200}: expected FAULT@N with an episode from 1 to {n_episodes}, for "
-                "example cable@2."
-            )
-        found[int(number)] = kind
-    return found
-
-
 def _session(
-    evaluation: "RealEvaluation",
-    args: argparse.Namespace,
-    faults: dict[int, str],
-    *,
-    stops: Callable[[], bool],
+    evaluation: "RealEvaluation", args: argparse.Namespace, asked: Connecting
 ) -> "SessionSummary | None":
     """Run the session; None for a dry run."""
     from vla_eval.config.evaluation import CaptureConfig
     from vla_eval.real.session import Session
 
-    with _connected(evaluation.robot, faults, stops) as station:
+    with connected(asked) as station:
         session = Session(
             evaluation=evaluation,
             station=station,
-            say=_say,
-            stops=stops,
+            say=say,
+            stops=asked.stops,
             capture=CaptureConfig(video="all" if args.capture_video else "none"),
         )
-        show = print if args.dry_run else _say  # then it is the result
-        for line in session.dry_run():
-            show(line)
-        if args.dry_run:
-            show(f"{len(evaluation.plan)} episodes in {evaluation.out}. Nothing was commanded.")
+        if _is_dry(args, session.dry_run(), f"{len(evaluation.plan)} episodes in {evaluation.out}."):
             return None
-        station.operator.ask("Is all of this right, is the arm free, and may it move?")
+        station.operator.ask(MAY_IT_MOVE)
         return session.run(command=typed_command(), allow_environment_change=args.allow_environment_change)
 
 
-@contextmanager
-def _connected(
-    settings: RobotSettings, faults: dict[int, str], stops: Callable[[], bool]
-) -> "Iterator[Station]":
-    """Connect the arm, and have somebody beside it."""
-    from vla_eval.envs.robot.link import RobotLink
-    from vla_eval.envs.robot.opening import open_robot
-    from vla_eval.envs.robot.robot_env import Station
-    from vla_eval.envs.robot.units import Units
-    from vla_eval.envs.robot.watch import StepClock, WallClock
-
-    with ExitStack() as ending:
-        device = open_robot(settings)
-        link = RobotLink(device)
-        Units.of(settings, link.motors)  # refuses limits of motors that are not there, before it connects
-        clock = StepClock() if settings.is_simulated else WallClock()
-        operator = _operator(settings, device, faults, clock, stops, ending)
-        ending.callback(link.disconnect)
-        link.connect()
-        yield Station.beside(link, operator, settings, clock)
+def _is_dry(args: argparse.Namespace, lines: list[str], planned: str) -> bool:
+    """Show what the dry run has found, and return whether that is all."""
+    show = print if args.dry_run else say  # then it is the result
+    for line in lines:
+        show(line)
+    if args.dry_run:
+        show(f"{planned} Nothing was commanded.")
+    return bool(args.dry_run)
 
 
-def _operator(
-    settings: RobotSettings,
-    device: Any,
-    faults: dict[int, str],
-    clock: Any,
-    stops: Callable[[], bool],
-    ending: ExitStack,
-) -> "Operator":  # Any: a robot of lerobot's, and a clock
-    if settings.is_simulated:
-        from vla_eval.envs.robot.scripted import ScriptedOperator
+def _record(args: argparse.Namespace, stop: "StopRequest") -> int:
+    from vla_eval.cli.shared.output import hint_next
 
-        device.faults.update(faults)
-        ending.callback(device.close)
-        return ScriptedOperator(device)
-    from vla_eval.envs.robot.keys import KeysOperator
-
-    terminal = sys.stdin.fileno()
-    return ending.enter_context(KeysOperator(settings, clock, descriptor=terminal, say=_say, stops=stops))
+    demonstrations = _demonstrations(args)
+    faults = named_faults(args.rehearse, demonstrations.robot, n_episodes=demonstrations.n_episodes)
+    asked = Connecting(settings=demonstrations.robot, faults=faults, stops=lambda: stop.is_asked)
+    recorded = _recording(demonstrations, args, asked)
+    if recorded is None:
+        return 0
+    for path, facts in recorded.datasets.items():
+        print(
+            f"{path}: {len(facts.episodes)} episodes, {facts.n_frames} frames; discarded: {facts.n_discarded}"
+        )
+    hint_next("finetune", "--policy", "act", "--dataset", next(iter(recorded.datasets)))
+    return 0
 
 
-def _fault_names() -> tuple[str, ...]:
-    from vla_eval.envs.robot.faults import FAULTS
+def _demonstrations(args: argparse.Namespace) -> "Demonstrations":
+    if args.robot is None:
+        raise RecipeError(
+            "Name an arm; --robot is missing. Example: mikasa-vla real record --robot simulated_so100"
+        )
+    robot = named_robot(args.robot, args.operator)
+    leader = named_leader(robot, args.teleop)
+    stages = tuple(dict.fromkeys(map(stage_of, args.stages)))
+    from vla_eval.real.demonstrations import Demonstrations
+    from vla_eval.real.leaders import in_motors
 
-    return tuple(FAULTS)
+    return Demonstrations(
+        robot=in_motors(robot),
+        leader=leader,
+        stages=stages,
+        episodes=DEMONSTRATIONS_PER_COLOR if args.episodes is None else args.episodes,
+        seed=args.plan_seed,
+        keep=args.keep or "successes",
+        named_out=args.out,
+    )
 
 
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
+def _recording(
+    demonstrations: "Demonstrations", args: argparse.Namespace, asked: Connecting
+) -> "RecordedStages | None":
+    """Run the recording; None for a dry run."""
+    from vla_eval.real.recording import RecordingSession
+
+    with connected(asked) as arm, led(arm) as (station, leader):
+        session = RecordingSession(
+            asked=demonstrations, station=station, leader=leader, say=say, stops=asked.stops
+        )
+        if _is_dry(
+            args, session.dry_run(), f"{demonstrations.n_episodes} demonstrations in {demonstrations.out}."
+        ):
+            return None
+        station.operator.ask(MAY_IT_MOVE)
+        return session.run(command=typed_command(), allow_environment_change=args.allow_environment_change)

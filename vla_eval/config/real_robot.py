@@ -4,9 +4,10 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Literal, get_args
 
 from vla_eval.config.files import to_data
+from vla_eval.control_modes import MOTORS
 from vla_eval.errors import RecipeError, unknown_name
 from vla_eval.strict.bounds import Bounds, check_bounds, require
 from vla_eval.strict.decoding import decode, load_yaml
@@ -14,9 +15,8 @@ from vla_eval.strict.decoding import decode, load_yaml
 SIMULATED_TYPE = "simulated_so100"
 """LeRobot's type of the simulated arm, and its name on the command line."""
 SIMULATED_HZ = 20.0  # of every task
-MOTORS: Final = "motors"
-"""Control mode: LeRobot's own numbers of the motors. Also the state that they are."""
 RealControlMode = Literal["motors", "pd_joint_pos"]
+REAL_CONTROL_MODES: tuple[RealControlMode, ...] = get_args(RealControlMode)
 TYPE = "type"
 ADDRESSES = ("port", "index_or_path", "serial_number_or_name")
 """LeRobot's fields that say where a device is found today."""
@@ -36,6 +36,8 @@ class RobotSettings:
 
     # LeRobot's configuration: `type`, `port`, `cameras` …
     lerobot: dict[str, Any]  # Any: plain data, which LeRobot checks
+    # LeRobot's configuration of what leads the arm in a demonstration: `type`, `port` …; no policy needs one
+    teleop: dict[str, Any] | None = None  # Any: as above
     control_hz: Annotated[float, Bounds(1, 200)] = 30.0
     # what an action is: `motors`, or `pd_joint_pos`, as policies that were trained in the simulator give it
     control_mode: RealControlMode = "motors"
@@ -60,8 +62,10 @@ class RobotSettings:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        kind = self.lerobot.get(TYPE)
-        require(isinstance(kind, str), "lerobot.type", repr(kind), "LeRobot's type, such as so101_follower")
+        devices = (("lerobot", self.lerobot, "so101_follower"), ("teleop", self.teleop, "so101_leader"))
+        for name, fields, example in devices:
+            kind = "" if fields is None else fields.get(TYPE)
+            require(isinstance(kind, str), f"{name}.type", repr(kind), f"LeRobot's type, such as {example}")
         for motor, pair in self.limits.items():
             sound = len(pair) == 2 and pair[0] < pair[1]
             require(sound, f"limits.{motor}", str(list(pair)), "two numbers, the lower one first")
@@ -85,8 +89,14 @@ class RobotSettings:
 
     @property
     def content(self) -> dict[str, Any]:  # Any: plain data
-        """All that results depend on: everything but where devices are found."""
-        return {**to_data(self), "lerobot": _without_addresses(self.lerobot)}
+        """All that a policy's results depend on: no address of a device, and not what leads the arm."""
+        fields = {**to_data(self), "lerobot": _without_addresses(self.lerobot)}
+        return {name: value for name, value in fields.items() if name != "teleop"}
+
+    @property
+    def teleop_content(self) -> dict[str, Any]:  # Any: plain data
+        """The fields of what leads the arm, without addresses; empty without one."""
+        return _without_addresses(self.teleop or {})
 
 
 def _without_addresses(fields: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data

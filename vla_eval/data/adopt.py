@@ -6,8 +6,8 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 
 from vla_eval import __version__
-from vla_eval.control_modes import EE_DELTA_POSE
-from vla_eval.data.check import check_videos, demonstrations_of, has_our_fields
+from vla_eval.control_modes import EE_DELTA_POSE, MOTORS
+from vla_eval.data.check import about_arm, check_videos, demonstrations_of, has_our_fields
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import require_sound
 from vla_eval.data.dataset_folder import digest_files
@@ -19,7 +19,7 @@ from vla_eval.data.foreign.lerobot_files import names_of
 from vla_eval.data.manifest import IMPORT_FILE, write_entry
 from vla_eval.data.opening import LocalDataset
 from vla_eval.errors import DatasetError
-from vla_eval.features import STATE_KEY, STATE_NAMES, SUCCESS_KEY, dataset_features
+from vla_eval.features import DONE_KEY, STATE_KEY, STATE_NAMES, SUCCESS_KEY, dataset_features
 from vla_eval.tasks.spec import TaskSpec
 
 
@@ -41,7 +41,8 @@ def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
             )
     dataset = LocalDataset(root)
     meta = dataset.meta
-    if not has_our_fields(meta.features):
+    demonstrations = demonstrations_of(dataset)
+    if not has_our_fields(meta.features) and not demonstrations.of_an_arm:
         raise DatasetError(
             f"{root}: its fields are not those of this project (docs/datasets.md). Import it: mikasa-vla "
             f"dataset convert {root} --to lerobot --out DIR"
@@ -49,7 +50,6 @@ def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
     wrong = [said.sentence for said in check_videos(dataset) if said.answer == "refused"]
     if wrong:
         raise DatasetError(f"{root}: {' '.join(wrong)}")
-    demonstrations = demonstrations_of(dataset)
     kept = require_sound(demonstrations)
     without = [camera for camera in meta.video_keys if camera not in (meta.stats or {})]
     if without:
@@ -58,6 +58,8 @@ def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
             "--operation.type recompute_stats"
         )
     write_statistics(root, [meta])
+    if demonstrations.of_an_arm:
+        kept = (*kept, *about_arm(demonstrations))
     facts = _facts(root, demonstrations, meta, task, kept)
     write_entry(root / IMPORT_FILE, facts)
     return facts
@@ -66,19 +68,20 @@ def adopt(root: Path, *, task: TaskSpec | None) -> ImportFacts:
 def _facts(
     root: Path, what: Demonstrations, meta: Any, task: TaskSpec | None, kept: tuple[str, ...]
 ) -> ImportFacts:
-    assert what.action is not None  # `has_our_fields`
-    mode = what.action.control_mode
-    state = next(kind for kind, names in STATE_NAMES.items() if names == names_of(meta.features[STATE_KEY]))
+    mode = MOTORS if what.action is None else what.action.control_mode  # None: `of_an_arm`
+    names = names_of(meta.features[STATE_KEY])
+    state = next((kind for kind, known in STATE_NAMES.items() if known == names), None)
+    ours = (SUCCESS_KEY, DONE_KEY) if state is None else dataset_features(state)
     other = other_sentences(what, task)
     return ImportFacts(
         complete=True,
         source_layout="adopted",
         task=None if task is None else task.id,
         instruction_source="source",
-        state=state,
+        state=state or MOTORS,
         control_mode=mode,
         executable_by_pd_ee_delta_pose=mode == EE_DELTA_POSE,
-        absent=tuple(key for key in dataset_features(state) if key not in meta.features),
+        absent=tuple(key for key in ours if key not in meta.features),
         left_out=(),
         n_frames=what.n_frames,
         episodes=tuple(_episode(what, number, first) for number, first in enumerate(what.firsts.tolist())),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple  # lerobot is untyped
 import numpy as np
 from av.error import FFmpegError
 
-from vla_eval.control_modes import CONTROL_MODES
+from vla_eval.control_modes import CONTROL_MODES, POSITION
 from vla_eval.data.checks.agreement import episodes_by_video
 from vla_eval.data.checks.demonstrated import Demonstrations
 from vla_eval.data.checks.rules import Answer, find_breaches, require_sound
@@ -24,6 +24,7 @@ from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.opening import LocalDataset, OpenDataset
 from vla_eval.errors import DatasetError
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, IMAGE_SIZE_PX, PROPRIO_KEYS, STATE_KEY, STATE_NAMES
+from vla_eval.tasks.real_stages import told_by
 from vla_eval.viz.mp4 import open_mp4
 
 STATISTICS = ("min", "max", "mean", "std")
@@ -67,11 +68,14 @@ def check(path: Path) -> CheckReport:
     dataset = LocalDataset(path)
     demonstrations = demonstrations_of(dataset)
     found = (*check_videos(dataset), *_statistics(dataset, demonstrations))
-    if facts is not None or has_our_fields(dataset.meta.features):
+    if facts is not None or has_our_fields(dataset.meta.features) or demonstrations.of_an_arm:
         known: Iterable[Said] = _breaches(demonstrations)
+        kind = "a LeRobotDataset with the fields of this project, without its records"
         if facts is not None and facts.is_checked:  # the rules were applied when it was made
             known = (Said("kept", sentence) for sentence in facts.kept)
-        kind = "a LeRobotDataset with the fields of this project, without its records"
+        elif demonstrations.of_an_arm:
+            known = (*known, *(Said("kept", sentence) for sentence in about_arm(demonstrations)))
+            kind = "a LeRobotDataset of an arm's motors"
         return CheckReport(
             path=path,
             kind=kind if facts is None else facts.kind,
@@ -100,6 +104,7 @@ def demonstrations_of(dataset: LocalDataset) -> Demonstrations:
     sentences = meta.tasks.index
     lengths = tuple(dataset.lengths)
     return Demonstrations(
+        of_an_arm=is_of_an_arm(meta.features),
         where=dataset.root,
         fps=meta.fps,
         names=tuple(f"episode {number}" for number in range(len(lengths))),
@@ -127,6 +132,29 @@ def has_our_fields(features: Any) -> bool:  # Any: lerobot's plain data
         and ACTION_KEY in features
         and names_of(features[ACTION_KEY]) in modes
     )
+
+
+def is_of_an_arm(features: Any) -> bool:  # Any: lerobot's plain data
+    """Whether state and action are the positions of the same motors, as LeRobot's robots name them."""
+    if STATE_KEY not in features or ACTION_KEY not in features:
+        return False
+    state, action = names_of(features[STATE_KEY]), names_of(features[ACTION_KEY])
+    return bool(state) and state == action and all(name.endswith(POSITION) for name in state)
+
+
+def about_arm(what: Demonstrations) -> tuple[str, ...]:
+    """Return what should be known of demonstrations on an arm that another program recorded."""
+    said = [
+        "It has no phases: in which frames the cue is shown is not stored.",
+        "Whether the motors' numbers are degrees, or -100 to 100, is not stored: `use_degrees` of the arm "
+        "that a policy of it drives has to be as it was in the recording.",
+    ]
+    for sentence in sorted({one for one in what.sentences if one}):
+        told = told_by(sentence)
+        stages = " or ".join(stage.name for stage in told.stages) or "none of the three stages"
+        color = f", {told.color}" if told.color else ", and no colour"
+        said.append(f"By its sentence {sentence!r:.200}: {stages}{color if told.stages else ''}.")
+    return tuple(said)
 
 
 def _of_source(source: Source, kind: str) -> CheckReport:

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple  # Any: lerobot's plain data
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.control_modes import POSITION
 from vla_eval.core import ImageArray
 from vla_eval.features import ACTION_KEY, FPS, STATE_KEY
 
@@ -28,6 +29,9 @@ add up to ten times that, 1 mm. Numbers of unknown unit have it, too: it keeps w
 divided by 0. Source:
 https://github.com/haosulab/ManiSkill/blob/628bbe64e2c925d9d543171361a86c4a4965c6e9/mani_skill/agents/robots/panda/panda.py
 """
+MOTOR_RESOLUTION = 360 / 4096
+"""The same of a motor's position in LeRobot's numbers: a step of an STS3215's encoder, in degrees.
+Source: its 4,096 steps per turn, as in `lerobot.motors.feetech.tables.MODEL_RESOLUTION`."""
 VELOCITY = "_velocity"  # end of the name of what has the unit 1/s; the others are per control step
 RANGES = (("min", "max"), ("q01", "q99"), ("q10", "q90"))
 
@@ -123,9 +127,10 @@ def about_still_dimensions(statistics: _Fields | None, features: _Fields) -> Ite
             if chosen.any():
                 lines.append(f"{field.key} {', '.join(np.array(names)[chosen])}")
     if still:
+        motors = f", of motors {MOTOR_RESOLUTION:.2g}" if any(POSITION in line for line in still) else ""
         yield (
             f"hardly move in these demonstrations; a policy that normalises takes their deviation as "
-            f"{RESOLUTION:g} (of velocities {RESOLUTION * FPS:g}): {'; '.join(still)}"
+            f"{RESOLUTION:g} (of velocities {RESOLUTION * FPS:g}){motors}: {'; '.join(still)}"
         )
     if rare:
         yield (
@@ -163,5 +168,10 @@ def _fields(statistics: _Fields | None, features: _Fields) -> Iterator[_Field]:
         if not isinstance(names, list | tuple) or len(names) != n_dims:  # of another program
             names = range(n_dims)
         named = [str(name) for name in names]
-        resolution = [RESOLUTION * (FPS if name.endswith(VELOCITY) else 1) for name in named]
-        yield _Field(key, named, found, np.array(resolution))
+        yield _Field(key, named, found, np.array([_resolution(name) for name in named]))
+
+
+def _resolution(name: str) -> float:
+    if name.endswith(POSITION):
+        return MOTOR_RESOLUTION
+    return RESOLUTION * (FPS if name.endswith(VELOCITY) else 1)

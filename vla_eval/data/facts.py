@@ -7,12 +7,15 @@ from itertools import combinations
 from pathlib import Path, PurePosixPath
 from typing import Any, ClassVar  # Any: plain data
 
+from vla_eval.control_modes import MOTORS
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.manifest import (
+    ARM_FILE,
     FETCH_AGAIN,
     IMPORT_FILE,
     MIXTURE_FILE,
     RECORDING_FILE,
+    ArmEpisode,
     FileDigest,
     from_json,
     read_content,
@@ -192,7 +195,45 @@ class MixtureFacts:
         return f"a mixture of {len(self.sources)} datasets, complete"
 
 
-type Facts = DatasetFacts | ImportFacts | MixtureFacts
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArmFacts:
+    """Demonstrations on an arm, and how they came about; for the rest see `Facts`."""
+
+    complete: bool
+    task: str
+    robot: str  # LeRobot's type
+    settings: dict[str, Any]  # how the arm was driven, see `RobotSettings.content`
+    # `leader`: what led it, LeRobot's type or `scripted`; `teleop`: LeRobot's fields of it
+    leader: str
+    teleop: dict[str, Any]
+    n_frames: Count
+    n_discarded: Count  # episodes without success that were not kept
+    episodes: tuple[ArmEpisode, ...]
+    environment: dict[str, Any]  # see `provenance.collect_environment`
+    files: dict[str, FileDigest]
+    vla_eval_version: str
+    state: ClassVar[str] = MOTORS
+    control_mode: ClassVar[str] = MOTORS
+    is_checked: ClassVar[bool] = True
+    kept: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """Its one task."""
+        return (self.task,)
+
+    @property
+    def seeds(self) -> dict[str, tuple[SeedRange, ...]]:
+        """Task -> the seeds of its trials."""
+        return {self.task: seed_ranges(one.seed for one in self.episodes)}
+
+    @property
+    def kind(self) -> str:
+        """What it is, for a person."""
+        return f"demonstrations of {self.task} on {self.robot}, complete"
+
+
+type Facts = DatasetFacts | ImportFacts | MixtureFacts | ArmFacts
 """What a dataset is. All kinds have these:
 
     complete      written as true, after everything else
@@ -241,6 +282,13 @@ KINDS = (
         made="mixed",
         again="Mix its sources again.",
         repair="Mix its sources again.",
+    ),
+    Kind(
+        cls=ArmFacts,
+        file=ARM_FILE,
+        made="recorded",
+        again="Run the command that records it again: it resumes.",
+        repair="Fetch the dataset again.",
     ),
 )
 """In the order in which they are looked for."""

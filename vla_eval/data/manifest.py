@@ -5,7 +5,8 @@
     recording.json  recipe, environment, counts, digest of every file; written last (see `facts`)
     replay.json     `ReplayReport`: what a replay of the stored actions found
 
-An imported dataset has `import.json` instead, one that was mixed of several has `mixture.json`.
+An imported dataset has `import.json` instead, one that was mixed of several `mixture.json`, and one of
+demonstrations on an arm `arm.json` and `failed.jsonl`.
 
 A folder of its own, because lerobot drops keys of `info.json` that it does not know. Standard library
 and numpy only: it knows nothing of lerobot.
@@ -48,6 +49,7 @@ RECORDING_FILE = MIKASA_FOLDER / "recording.json"
 REPLAY_FILE = MIKASA_FOLDER / "replay.json"
 IMPORT_FILE = MIKASA_FOLDER / "import.json"
 MIXTURE_FILE = MIKASA_FOLDER / "mixture.json"
+ARM_FILE = MIKASA_FOLDER / "arm.json"
 
 FETCH_AGAIN = "The file was changed by another program; fetch or record the dataset again."
 
@@ -101,6 +103,23 @@ class RecordedEpisode:
     @property
     def _n_action_dims(self) -> int:
         return len(action_of(self.env_kwargs).dims)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArmEpisode:
+    """One demonstration on an arm: how the table was set, its phases, and what the operator marked."""
+
+    number: Positive  # of its trial in the plan
+    seed: Count  # of the trial
+    instruction: str
+    color: str  # of the right cube
+    places: tuple[Count, ...]  # of each cube, from the arm's right, in the order of `real_stages.COLORS`
+    cue_steps: Count
+    delay_steps: Count
+    n_steps: Positive
+    # control steps executed when the right cube was marked as picked; None if it never was
+    success_step: Positive | None
+    touched: tuple[str, ...]  # colours, in the order in which they were marked
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,7 +186,7 @@ def from_json[E](cls: type[E], text: str | bytes, *, where: str) -> E:
     return as_dataclass(cls, data, source)
 
 
-def write_lines(path: Path, entries: Sequence[RecordedEpisode | FailedSeed]) -> None:
+def write_lines(path: Path, entries: Sequence[RecordedEpisode | ArmEpisode | FailedSeed]) -> None:
     """Write entries, one per line, whole or not at all."""
     replace_file(path, "".join(f"{to_json(entry)}\n" for entry in entries))
 
@@ -201,7 +220,7 @@ def read_replay(dataset: Path) -> ReplayReport | None:
     return from_json(ReplayReport, read_content(path), where=str(path)) if path.exists() else None
 
 
-def read_entries[E: RecordedEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
+def read_entries[E: RecordedEpisode | ArmEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
     """Return the entries of a file, one per line; raise `DatasetError` if it is missing or damaged."""
     data = read_content(path)
     if data and not data.endswith(b"\n"):

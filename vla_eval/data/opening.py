@@ -23,9 +23,10 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from lerobot.datasets.utils import DatasetInfo
 from PIL.Image import DecompressionBombError
 
+from vla_eval.control_modes import MOTORS
 from vla_eval.data.checks.agreement import check_meta, check_rows
 from vla_eval.data.dataset_folder import check_complete
-from vla_eval.data.facts import DatasetFacts, Facts, MixtureFacts, files_sha256
+from vla_eval.data.facts import ArmFacts, DatasetFacts, Facts, MixtureFacts, files_sha256
 from vla_eval.data.folder_contents import check_folder
 from vla_eval.data.info_file import INFO_FILE
 from vla_eval.data.lerobot_tables import Tables, frames_for_lerobot
@@ -41,7 +42,7 @@ from vla_eval.data.manifest import (
 )
 from vla_eval.data.tables import EPISODE_TABLES, FRAME_TABLES, Columns
 from vla_eval.errors import DatasetError
-from vla_eval.features import SUCCESS_KEY
+from vla_eval.features import CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.seeding import SeedRange, seed_ranges
 
 UNREADABLE = (
@@ -151,6 +152,13 @@ class OpenDataset:
         return self.local.meta
 
     @property
+    def cameras(self) -> tuple[str, ...]:
+        """The images that policies are trained on: ours of tasks, all of an arm."""
+        if self.facts.control_mode == MOTORS:
+            return tuple(key for key in self.meta.camera_keys if key not in self.meta.depth_keys)
+        return tuple(CAMERA_KEYS.values())
+
+    @property
     def columns(self) -> Columns:
         """The numbers of all its episodes, frame by frame."""
         return self.local.columns
@@ -204,7 +212,7 @@ class OpenDataset:
     @property
     def seeds(self) -> dict[str, tuple[SeedRange, ...]] | None:
         """Task -> the seeds of its episodes, as far as they are known; None for an import."""
-        if isinstance(self.facts, MixtureFacts):
+        if isinstance(self.facts, MixtureFacts | ArmFacts):
             return self.facts.seeds
         seeds: dict[str, set[int]] = {}
         for episode in self.manifest:

@@ -1,1 +1,1 @@
-"""Evaluations on a real arm: the plan, the session with an operator, its table. Knows no motor or camera."""
+"""Evaluations and demonstrations on a real arm: plan, session, table. Knows no motor or camera."""

@@ -1,20 +1,22 @@
 """What a person asks to be evaluated on an arm: resolved once, at the door."""
 
+import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any  # plain data
 
-from vla_eval.checkpoints.notes import checkpoint_hashes
+from vla_eval.checkpoints.notes import checkpoint_hashes, trained_control_mode
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.config.files import digest_of
-from vla_eval.config.real_robot import RobotSettings
+from vla_eval.config.real_robot import REAL_CONTROL_MODES, RobotSettings
 from vla_eval.errors import RecipeError, SpecMismatchError
 from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.recipe import bare_policy
 from vla_eval.policies.registry import PRIVILEGED, check_adapter
-from vla_eval.real.plan import PlannedEpisode, make_plan
+from vla_eval.real.episodes import RUN
+from vla_eval.real.plan import FIRST_DEMONSTRATION_BLOCK, PlannedEpisode, make_plan
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.storage.provenance import collect_environment
@@ -23,7 +25,6 @@ from vla_eval.storage.run_folder import RunDescription
 from vla_eval.strict.bounds import MAX_EPISODES, check_seeds, require
 from vla_eval.tasks.real_stages import COLORS, Stage, stage_of
 
-RUN = 0
 RANDOM = "random"  # adapter
 
 
@@ -42,7 +43,8 @@ class RealEvaluation:
     def __post_init__(self) -> None:
         """Refuse what cannot be run."""
         n_episodes = self.episodes * len(self.stages) * len(COLORS) * len(self.policies)
-        require(self.episodes >= 1, "--episodes", str(self.episodes), "1 or more")
+        most = FIRST_DEMONSTRATION_BLOCK
+        require(1 <= self.episodes <= most, "--episodes", str(self.episodes), f"from 1 to {most}")
         check_seeds(self.seed, name="--plan-seed")
         require(n_episodes <= MAX_EPISODES, "the plan", f"{n_episodes} episodes", f"at most {MAX_EPISODES}")
         for entry in self.policies:
@@ -88,6 +90,17 @@ class RealEvaluation:
                 f"for all stages, or one for each: {name}:{stage.twin_id}=DIR …"
             )
         return own[0]
+
+    def settings(self, entry: PolicyEntry) -> RobotSettings:
+        """Return how a policy drives the arm: by the actions of its training, else as the arm's file says.
+
+        Raises:
+            RecipeError: they are angles of the arm's model, and the zeros of its joints are not known.
+        """
+        mode = trained_control_mode(entry.value.adapter, entry.recipes[0].value.args)
+        mode = mode if entry.server is None else entry.server.control_mode
+        known = next((one for one in REAL_CONTROL_MODES if one == mode), self.robot.control_mode)
+        return dataclasses.replace(self.robot, control_mode=known)
 
     @cached_property
     def plan(self) -> tuple[PlannedEpisode, ...]:

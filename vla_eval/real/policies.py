@@ -1,29 +1,30 @@
 """The policies of a session, each loaded once: a network that serves all stages is not loaded three times."""
 
-from collections.abc import Mapping
+from collections.abc import Callable
 
 from vla_eval.config.files import digest_of
 from vla_eval.core import Policy
 from vla_eval.episode_log import check_execution
 from vla_eval.policies.context import PolicyContext
+from vla_eval.policies.entries import PolicyEntry
 from vla_eval.policies.registry import SCRIPTED, make_from_adapter
 from vla_eval.real.evaluation import RealEvaluation
 from vla_eval.real.plan import PlannedEpisode
 from vla_eval.specs import EnvSpec, check_compatible
-from vla_eval.tasks.real_stages import COLORS
+from vla_eval.tasks.real_stages import COLORS, Stage
 
 
 class SessionPolicies:
     """Policies by the episodes that they run."""
 
-    def __init__(self, evaluation: RealEvaluation, specs: Mapping[str, EnvSpec]) -> None:
-        """Load all; `specs`: name of a stage -> what its environment offers.
+    def __init__(self, evaluation: RealEvaluation, offered: Callable[[Stage, PolicyEntry], EnvSpec]) -> None:
+        """Load all; `offered`: what the environment of a stage offers to a policy.
 
         Raises:
             VlaEvalError: one cannot be loaded, or does not fit.
         """
         self._evaluation = evaluation
-        self._specs = specs
+        self._offered = offered
         self._loaded: dict[tuple[str, str], Policy] = {}
         for planned in evaluation.plan:
             self.of(planned)
@@ -36,7 +37,7 @@ class SessionPolicies:
         of_stage = stage.name if entry.value.adapter in SCRIPTED else ""
         key = (entry.part(0), of_stage)
         if key not in self._loaded:
-            env, chunking = self._specs[stage.name], self._evaluation.rollout(entry).chunking
+            env, chunking = self._offered(stage, entry), self._evaluation.rollout(entry).chunking
             context = PolicyContext(name=entry.name, env=env, chunking=chunking, n_candidates=len(COLORS))
             args = entry.recipes[0].value.args
             if entry.server is not None:

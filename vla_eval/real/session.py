@@ -5,16 +5,17 @@ its cause, and the same command runs it again. Nothing moves before the operator
 """
 
 import dataclasses
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from vla_eval.config.evaluation import CaptureConfig
-from vla_eval.core import EpisodeStart, ObservationWindow, Stage, StepObserver, infer
+from vla_eval.core import ObservationWindow, StepObserver, infer
 from vla_eval.envs.robot.robot_env import SLOT, RobotEnv, Station
 from vla_eval.episode_log import chunk_problem
-from vla_eval.errors import InvalidActionError, RobotBusError, TooManyErrorsError
-from vla_eval.real.evaluation import RUN, RealEvaluation
+from vla_eval.errors import InvalidActionError, RobotBusError
+from vla_eval.policies.entries import PolicyEntry
+from vla_eval.real.episodes import StageClock, about_station, ask_after_error, start_of
+from vla_eval.real.evaluation import RealEvaluation
 from vla_eval.real.mark_images import MarkImages
 from vla_eval.real.plan import PlannedEpisode
 from vla_eval.real.policies import SessionPolicies
@@ -26,11 +27,6 @@ from vla_eval.tasks import real_stages
 from vla_eval.tasks.real_stages import COLORS, Trial
 from vla_eval.viz.capture import EpisodeCapture
 from vla_eval.workers.messages import describe_error
-
-MAX_CONSECUTIVE_ERRORS = 5
-TIMED: tuple[Stage, ...] = ("reset", "step", "inference")
-LIMITS = ("control_hz", "max_step", "response_seconds", "stale_frames", "max_gap_seconds")
-"""Settings that the dry run shows."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,39 +43,6 @@ class SessionSummary:
     n_errors: int
 
 
-@dataclass(slots=True)
-class _StageClock:
-    """Seconds of an episode, by what was being done; asks before each whether the session has to stop."""
-
-    stops: Callable[[], bool]
-    stage: Stage = "setup"
-    began: float = field(default_factory=time.monotonic)
-    seconds: dict[Stage, float] = field(default_factory=lambda: dict.fromkeys(TIMED, 0.0))
-
-    def __call__(self, stage: Stage) -> None:
-        if self.stops():
-            raise KeyboardInterrupt
-        self._add_up()
-        self.stage = stage
-
-    def timing(self, record: EpisodeRecord) -> EpisodeTiming:
-        """Return the times of the episode that has just ended."""
-        self._add_up()
-        return EpisodeTiming(
-            key=record.key,
-            total_seconds=sum(self.seconds.values()),
-            reset_seconds=self.seconds["reset"],
-            step_seconds=self.seconds["step"],
-            inference_seconds=self.seconds["inference"],
-        )
-
-    def _add_up(self) -> None:
-        now = time.monotonic()
-        if self.stage in self.seconds:
-            self.seconds[self.stage] += now - self.began
-        self.began = now
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Session:
     """An evaluation beside an arm that is connected."""
@@ -93,9 +56,8 @@ class Session:
 
     def __post_init__(self) -> None:
         """Load the policies: a mistake appears before anything is written."""
-        envs = {stage: self._env(stage) for stage in self.evaluation.stages}
-        specs = {stage.name: env.spec for stage, env in envs.items()}
-        object.__setattr__(self, "policies", SessionPolicies(self.evaluation, specs))
+        policies = SessionPolicies(self.evaluation, lambda stage, entry: self._env(stage, entry).spec)
+        object.__setattr__(self, "policies", policies)
 
     def dry_run(self) -> list[str]:
         """Read the arm, ask each policy once, command nothing; return what a person has to check.
@@ -104,16 +66,7 @@ class Session:
             RobotError: the arm cannot be read.
             VlaEvalError: a policy does not fit.
         """
-        station, lines = self.station, []
-        for name, position in zip(station.link.motors, station.link.read().motors.tolist(), strict=True):
-            limits = station.settings.limits.get(name)
-            within = "no limits" if limits is None else f"within {limits[0]:g} to {limits[1]:g}"
-            home = station.settings.home.get(name)
-            at_home = "home is here" if home is None else f"home {home:g}"
-            lines.append(f"motor {name}: {position:.1f}, {within}, {at_home}")
-        for camera in station.link.cameras:
-            lines.append(f"camera {camera.name}: {camera.width_px} x {camera.height_px}")
-        lines += [f"{name}: {getattr(station.settings, name):g}" for name in LIMITS]
+        lines = about_station(self.station)
         rows = {(one.policy, one.trial.stage.name): one for one in reversed(self.evaluation.plan)}
         for planned in rows.values():
             self._ask(planned)
@@ -156,14 +109,15 @@ class Session:
     ) -> tuple[EpisodeRecord, EpisodeTiming | None]:
         """Run an episode; whatever goes wrong becomes its error, and the arm is stopped."""
         evaluation, trial = self.evaluation, planned.trial
-        env, policy = self._env(trial.stage, trial), self.policies.of(planned)
-        start = _start(env, trial)
-        settings = evaluation.rollout(evaluation.entry(planned.policy, trial.stage))
+        entry = evaluation.entry(planned.policy, trial.stage)
+        env, policy = self._env(trial.stage, entry, trial), self.policies.of(planned)
+        start = start_of(env, trial)
+        settings = evaluation.rollout(entry)
         seed_global_generators("episodes", start.task, start.run, start.seed)
         capture = EpisodeCapture(config=self.capture, folder=folder.path, seed_start=0)
         tapes = capture.tapes([start], with_images=True) if self.capture.is_on else None
         observers: list[StepObserver] = [MarkImages(folder.path, trial.number), *([tapes] if tapes else [])]
-        clock = _StageClock(self.stops)
+        clock = StageClock(self.stops)
         try:
             (record,) = rollout(env, policy, [start], settings, observers=observers, heartbeat=clock)
         except Exception as exc:  # of the arm, the operator, the policy: none of them is a failure
@@ -188,25 +142,19 @@ class Session:
     def _after_error(self, trial: Trial, record: EpisodeRecord, n_in_row: int) -> None:
         """Have the arm ready again, and ask whether to continue."""
         assert record.error is not None
-        cause = f"{record.error.kind} during {record.error.stage}: {record.error.message}"
-        if n_in_row >= MAX_CONSECUTIVE_ERRORS:
-            raise TooManyErrorsError(
-                f"{n_in_row} episodes in a row ended in an error. The last: episode {trial.number}: "
-                f"{cause} All results are kept in {self.evaluation.out}; the same command runs the others."
-            )
-        self.station.operator.ask(
-            f"{cause}\nThe episode is run again by the same command. Continue with the next?"
-        )
+        ask_after_error(self.station, trial, record.error, n_in_row, out=self.evaluation.out)
         if record.error.kind == RobotBusError.__name__:
             self.station.link.reconnect()
 
-    def _env(self, stage: real_stages.Stage, *trials: Trial) -> RobotEnv:
-        return RobotEnv(self.station, stage, {one.seed: one for one in trials})
+    def _env(self, stage: real_stages.Stage, entry: PolicyEntry, *trials: Trial) -> RobotEnv:
+        station = self.station.driven(self.evaluation.settings(entry))
+        return RobotEnv(station, stage, {one.seed: one for one in trials})
 
     def _ask(self, planned: PlannedEpisode) -> None:
         """Ask a policy for a chunk on what the arm sees now; nothing is executed."""
-        env, policy, stage = self._env(planned.trial.stage), self.policies.of(planned), planned.trial.stage
-        start = _start(env, planned.trial).worded({"color": COLORS[planned.trial.color]})
+        policy, stage = self.policies.of(planned), planned.trial.stage
+        env = self._env(stage, self.evaluation.entry(planned.policy, stage))
+        start = start_of(env, planned.trial).worded({"color": COLORS[planned.trial.color]})
         policy.reset([start])
         (chunk,) = infer(
             policy, [ObservationWindow(slot=SLOT, frames=(env.look().as_declared(policy.spec),))]
@@ -214,14 +162,3 @@ class Session:
         problem = chunk_problem(chunk, chunk_size=policy.spec.chunk_size, dims=env.spec.action.dims)
         if problem is not None:
             raise InvalidActionError(f"policy '{policy.spec.name}', dry run of {stage.name}: {problem}")
-
-
-def _start(env: RobotEnv, trial: Trial) -> EpisodeStart:
-    return EpisodeStart(
-        slot=SLOT,
-        task=env.spec.task,
-        seed=trial.seed,
-        run=RUN,
-        instruction=trial.stage.instruction,
-        horizon_steps=env.spec.horizon_steps,
-    )

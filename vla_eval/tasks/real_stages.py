@@ -11,6 +11,7 @@ from typing import Literal, NamedTuple
 from vla_eval.errors import unknown_name
 from vla_eval.task_state import Phase
 
+TWIN = "real_twin/"  # namespace of the ids of the simulated stages
 COLORS = ("red", "green", "blue")
 """The cubes, in the order of their indices as candidates."""
 PLACES = ("on the arm's right", "in the middle", "on the arm's left")
@@ -18,6 +19,8 @@ CHANCE = 1 / len(COLORS)
 """Success rate of a perfect arm that knows neither sentence nor cue."""
 EPISODES_PER_COLOR = 10
 PAPER_EPISODES = EPISODES_PER_COLOR * len(COLORS)
+DEMONSTRATIONS_PER_COLOR = 100
+"""Source: the paper, as above: 300 per stage, of three colours."""
 RESPONSE_SECONDS = 30.0  # ours: the paper gives no limit
 PICK, REMEMBER = "Pick the {color} cube", "Remember the color of the cube and then pick the matching one"
 
@@ -55,7 +58,7 @@ class Stage:
     @property
     def twin_id(self) -> str:
         """Id of the task that simulates it."""
-        return f"real_twin/{self.name}-v0"
+        return f"{TWIN}{self.name}-v0"
 
     @property
     def real_id(self) -> str:
@@ -130,6 +133,31 @@ class Trial:
             place=PLACES[self.places[self.color]],
             order=", ".join(COLORS[index] for index in by_place),
         )
+
+
+class Told(NamedTuple):
+    """What a sentence says: the stages that have it, and the colour, if it names one."""
+
+    stages: tuple[Stage, ...]
+    color: str | None
+
+
+def told_by(sentence: str) -> Told:
+    """Return what the sentence of an episode says; letter case, blanks and a full stop do not count."""
+    plain = _plain(sentence)
+    told = {
+        color: tuple(stage for stage in STAGES if _plain(stage.instruction.format(color=color)) == plain)
+        for color in COLORS
+    }
+    named = {color: stages for color, stages in told.items() if stages}
+    if len(named) == 1:
+        (color, stages), *_ = named.items()
+        return Told(stages, color)
+    return Told(next(iter(named.values()), ()), None)
+
+
+def _plain(sentence: str) -> str:
+    return " ".join(sentence.casefold().split()).rstrip(".")
 
 
 def stage_of(task: str) -> Stage:

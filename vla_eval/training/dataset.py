@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from vla_eval.config.finetuning import FinetuneRecipe
-from vla_eval.control_modes import CONTROL_MODES
+from vla_eval.control_modes import CONTROL_MODES, MOTORS
 from vla_eval.data.check import require_checked
 from vla_eval.data.facts import DatasetFacts, MixtureFacts
 from vla_eval.data.info_file import one_dataset
 from vla_eval.data.opening import OpenDataset, open_dataset
 from vla_eval.errors import DatasetError
-from vla_eval.features import ACTION_KEY, CAMERA_KEYS
+from vla_eval.features import ACTION_KEY
 from vla_eval.models.episodes.samples import decisions
 
 
@@ -24,19 +24,22 @@ def training_dataset(root: Path, *, allow_unreplayed: bool) -> OpenDataset:
     """Return a folder's dataset if it is complete and replayed without a mismatch, unless that is waived."""
     dataset = open_dataset(one_dataset(root))
     root, control_mode = dataset.root, dataset.facts.control_mode
-    if not dataset.was_replayed and not allow_unreplayed:
+    of_an_arm = control_mode == MOTORS  # which nothing replays: an operator has marked its successes
+    if not dataset.was_replayed and not allow_unreplayed and not of_an_arm:
         raise DatasetError(
             f"{root}: no replay has confirmed this dataset: it is not known whether its actions lead to what "
             f"its images show. {_to_replay(dataset)}; or train on it all the same with --allow-unreplayed, "
             f"which is noted in the run."
         )
-    if control_mode not in CONTROL_MODES:
+    if control_mode not in CONTROL_MODES and not of_an_arm:
         raise DatasetError(
             f"{root}: its actions are for '{control_mode}', which the environments here do not execute (they "
             f"take {', '.join(CONTROL_MODES)}). A policy that is trained on it could not be evaluated."
         )
     require_checked(dataset)
-    missing = [key for key in CAMERA_KEYS.values() if key not in dataset.meta.features]
+    missing = [key for key in dataset.cameras if key not in dataset.meta.features]
+    if not dataset.cameras:
+        raise DatasetError(f"{root}: expected images, found none: policies here see through cameras.")
     if missing:
         raise DatasetError(f"{root}: expected the images {', '.join(missing)}, found none of that name.")
     return dataset

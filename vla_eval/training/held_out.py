@@ -17,7 +17,7 @@ from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import digest_of, to_data
 from vla_eval.config.finetuning import FinetuneRecipe, HeldOutConfig
 from vla_eval.config.prompts import instruction_for
-from vla_eval.control_modes import CONTROL_MODE
+from vla_eval.control_modes import CONTROL_MODE, MOTORS
 from vla_eval.errors import RecipeError
 from vla_eval.evaluation.evaluate import EvaluationObserver, evaluate
 from vla_eval.evaluation.resolve import resolve
@@ -175,6 +175,11 @@ class _UntilStopped(EvaluationObserver):
 
 def check_held_out(settings: HeldOutConfig, recipe: FinetuneRecipe, dataset: "OpenDataset") -> str:
     """Return the task that is evaluated, if the seeds are held out and the steps have checkpoints."""
+    if dataset.facts.control_mode == MOTORS:
+        raise RecipeError(
+            f"held_out: expected demonstrations of a task that is simulated, found those of an arm "
+            f"({dataset.name}). Leave held_out out, and evaluate the checkpoint: mikasa-vla real."
+        )
     if settings.every_steps % recipe.save_every_steps:
         raise RecipeError(
             f"held_out.every_steps is {settings.every_steps}, expected a multiple of finetune."
@@ -223,6 +228,8 @@ def asked_warnings(facts: TrainingFacts, task: str | None, *, policy: str) -> li
         asked = instruction_for(task_spec(task))
         sentence = about_sentence(facts.sentences, asked, policy=policy, task=task)
         return [] if sentence is None else [sentence]
+    if facts.control_mode == MOTORS:  # `mikasa-vla real` takes it
+        return []
     robot = PANDA.name if facts.robot is None else facts.robot
     env = env_spec(control_mode=facts.control_mode, robot=robot)
     return [f"every evaluation would refuse this policy: {line}" for line in differences(facts, Asked(env))]

@@ -11,10 +11,10 @@ from lerobot.configs.train import TrainPipelineConfig
 from vla_eval.checkpoints.files import MODEL_FOLDER, TrainingFacts, find_checkpoint, read_facts
 from vla_eval.checkpoints.loading import config_class
 from vla_eval.config.finetuning import FinetuneConfig, FinetuneRecipe, HeldOutConfig
-from vla_eval.control_modes import action_spec
+from vla_eval.control_modes import MOTORS, action_spec
 from vla_eval.data.opening import OpenDataset, decoder_for
 from vla_eval.errors import RecipeError
-from vla_eval.features import CAMERA_KEYS, RewardKind
+from vla_eval.features import RewardKind
 from vla_eval.models.shared.earlier_frames import SampleMemory
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.robots.find import robots
@@ -90,7 +90,7 @@ class TrainingJob:
             dataset_sha256=dataset.sha256,
             task=facts.task or "",
             state=facts.state,
-            images={field: tuple(features[field]["shape"][:2]) for field in CAMERA_KEYS.values()},
+            images={field: tuple(features[field]["shape"][:2]) for field in dataset.cameras},
             fps=float(dataset.meta.fps),
             action_names=tuple(features["action"]["names"]),
             control_mode=facts.control_mode,
@@ -98,7 +98,9 @@ class TrainingJob:
             seeds=_with_base(dataset.seeds, None if below is None else below.seeds),
             tasks=facts.tasks,
             sentences=_with_base(dataset.sentences, None if below is None else below.sentences),
-            gripper_open=action_spec(facts.control_mode).gripper_open,
+            gripper_open=None
+            if facts.control_mode == MOTORS
+            else action_spec(facts.control_mode).gripper_open,
             robot=dataset.meta.robot_type if dataset.meta.robot_type in robots() else None,
         )
 

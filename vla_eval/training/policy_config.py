@@ -33,7 +33,7 @@ from vla_eval.errors import (
     check_names,
     did_you_mean,
 )
-from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, CAMERA_KEYS, STATE_KEY
+from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.models.families import family_of
 from vla_eval.models.weights.trainable import check_lora
 
@@ -169,14 +169,15 @@ def _base_config(recipe: FinetuneRecipe, cls: Any, folder: Path) -> dict[str, An
 
 def _set_features(config: Any, recipe: FinetuneRecipe, dataset: OpenDataset) -> None:
     """Let the policy expect just what the dataset has, under the base's names."""
+    cameras = dataset.cameras
     for field in recipe.rename_cameras:
-        if field not in CAMERA_KEYS.values():
+        if field not in cameras:
             raise SpecMismatchError(
                 f"finetune.rename_cameras: the dataset has no image '{field}' (it has: "
-                f"{', '.join(CAMERA_KEYS.values())}).{did_you_mean(field, CAMERA_KEYS.values())}"
+                f"{', '.join(cameras)}).{did_you_mean(field, cameras)}"
             )
     features = dataset_to_policy_features(dataset.meta.features)
-    inputs = {recipe.rename_cameras.get(field, field): features[field] for field in CAMERA_KEYS.values()}
+    inputs = {recipe.rename_cameras.get(field, field): features[field] for field in cameras}
     if recipe.base_checkpoint is not None:
         absent = [key for key in inputs if key not in config.image_features]
         if absent:

@@ -31,6 +31,8 @@ class Demonstrations:
     image_sizes_px: Mapping[str, tuple[int, int]]  # camera -> height and width
     # height and width that images shall have; None: any, if it is the same for all
     expected_px: int | None = None
+    # whether they are of an arm that LeRobot drives: its rate and its cameras are its own
+    of_an_arm: bool = False
     is_gripper_named: bool = False  # whether the user has said what the gripper's commands mean
 
     @property

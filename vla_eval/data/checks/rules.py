@@ -69,12 +69,12 @@ def require_sound(demonstrations: Demonstrations, *, rules: Sequence[Rule] | Non
 
 
 def _frame_rate(what: Demonstrations) -> Iterator[str]:
-    if what.fps != FPS:
+    if what.fps != FPS and not what.of_an_arm:
         yield f"It has {what.fps:g} frames per second, expected {FPS}: one per control step."
 
 
 def _image_sizes(what: Demonstrations) -> Iterator[str]:
-    sizes = set(what.image_sizes_px.values())
+    sizes = set() if what.of_an_arm else set(what.image_sizes_px.values())
     wanted = {(what.expected_px,) * 2} if what.expected_px else {(size[0],) * 2 for size in sizes}
     if sizes and (sizes != wanted or len(sizes) > 1):
         found = ", ".join(f"{name} {size[0]} × {size[1]}" for name, size in what.image_sizes_px.items())

@@ -14,7 +14,7 @@ from vla_eval import __version__
 from vla_eval.data.check import require_checked
 from vla_eval.data.dataset_folder import digest_files
 from vla_eval.data.exact_statistics import QUANTILES, vector_statistics
-from vla_eval.data.facts import DatasetFacts, MixtureFacts, MixtureSource
+from vla_eval.data.facts import ArmFacts, DatasetFacts, MixtureFacts, MixtureSource
 from vla_eval.data.manifest import MIXTURE_FILE, write_entry
 from vla_eval.data.opening import OpenDataset, join_datasets, open_dataset
 from vla_eval.data.tables import read_columns
@@ -67,7 +67,6 @@ def _open(root: Path) -> OpenDataset:
 
 def _source(opened: OpenDataset) -> MixtureSource:
     facts, meta = opened.facts, opened.meta
-    is_recorded = isinstance(facts, DatasetFacts)
     return MixtureSource(
         name=opened.name,
         task=facts.task,
@@ -76,10 +75,17 @@ def _source(opened: OpenDataset) -> MixtureSource:
         n_episodes=int(meta.total_episodes),
         n_frames=int(meta.total_frames),
         sha256=opened.sha256,
-        seeds=tuple(episode.seed for episode in opened.manifest) if is_recorded else None,
+        seeds=_seeds(opened),
         failed_seeds=tuple(failed.seed for failed in opened.failed_seeds),
         was_replayed=opened.was_replayed,
     )
+
+
+def _seeds(opened: OpenDataset) -> tuple[int, ...] | None:
+    if isinstance(opened.facts, ArmFacts):
+        return tuple(one.seed for one in opened.facts.episodes)
+    is_recorded = isinstance(opened.facts, DatasetFacts)
+    return tuple(episode.seed for episode in opened.manifest) if is_recorded else None
 
 
 def _refuse_difference(first: OpenDataset, other: OpenDataset) -> None:

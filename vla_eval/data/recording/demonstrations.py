@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,7 @@ from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.seeding import Stream, generator
 from vla_eval.specs import EnvSpec, PolicySpec
 from vla_eval.strict.json_text import Count, Positive
+from vla_eval.task_state import Phase
 
 SLOT = 0
 ONE_BY_ONE = ChunkingSpec(n_action_steps=1)
@@ -146,6 +148,20 @@ def images_digests(frames: Sequence[Mapping[str, ImageArray]]) -> dict[str, str]
     return {camera: digest.hexdigest() for camera, digest in digests.items()}
 
 
+class PhaseSteps(NamedTuple):
+    """Lengths of the first two phases of an episode, in control steps."""
+
+    cue: int
+    delay: int
+
+
+def phase_steps(phases: Sequence[Phase | None]) -> PhaseSteps:
+    """Return how long the phases of an episode were; `phases`: at reset, and after each control step."""
+    cue = next((i for i, phase in enumerate(phases) if phase != "cue"), len(phases))
+    response = next((i for i, phase in enumerate(phases) if phase == "response"), len(phases))
+    return PhaseSteps(cue, response - cue)
+
+
 def attempt(
     env: SimEnv,
     expert: Policy,
@@ -159,15 +175,13 @@ def attempt(
     (record,) = rollout(env, expert, [start], settings, observers=[log], heartbeat=heartbeat)
     executed = log.executed()
     intended = env.spec.action.clipped(np.stack(log.asked))
-    phases = [result.status.phase for result in log.results]
-    cue_steps = next((i for i, phase in enumerate(phases) if phase != "cue"), len(phases))
-    response_step = next((i for i, phase in enumerate(phases) if phase == "response"), len(phases))
+    steps = phase_steps([result.status.phase for result in log.results])
     return Attempt(
         seed=start.seed,
         success_step=record.success_step,
         n_steps=len(executed),
-        cue_steps=cue_steps,
-        delay_steps=response_step - cue_steps,
+        cue_steps=steps.cue,
+        delay_steps=steps.delay,
         actions=encode_actions(executed),
         intended_actions=None if np.array_equal(executed, intended) else encode_actions(intended),
         states_sha256=states_digest(log.results),

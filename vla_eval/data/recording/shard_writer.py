@@ -1,11 +1,13 @@
 """Write episodes as small LeRobotDatasets that appear whole or not at all, and put them together."""
 
-from collections.abc import Iterable, Sequence
+import contextlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self  # Any: lerobot is untyped
 
 import av
 import numpy as np
+from datasets.utils import are_progress_bars_disabled, disable_progress_bars, enable_progress_bars
 from lerobot.configs import RGBEncoderConfig
 from lerobot.datasets.io_utils import write_stats
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -18,11 +20,11 @@ from vla_eval.data.exact_statistics import (
     image_statistics,
     vector_statistics,
 )
-from vla_eval.data.manifest import MIKASA_FOLDER, RecordedEpisode, read_entries, write_lines
+from vla_eval.data.manifest import MIKASA_FOLDER, ArmEpisode, RecordedEpisode, read_entries, write_lines
 from vla_eval.data.opening import join_datasets, video_decoder
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
-from vla_eval.features import CAMERA_KEYS, FPS, EncoderSettings
+from vla_eval.features import FPS, EncoderSettings
 from vla_eval.robots.rows import PANDA
 from vla_eval.storage.drafts import draft_path, publish, remove_drafts
 
@@ -43,16 +45,18 @@ class ShardWriter:
         encoder: EncoderSettings,
         max_frames: int,
         robot: str = PANDA.name,
+        fps: int = FPS,
     ) -> None:
         """Take what shards must have in common to become one dataset, see `new_dataset`."""
         self._path = path
         remove_drafts(path)
         self._draft = draft_path(path)
         self._draft.parent.mkdir(parents=True, exist_ok=True)
-        self._episodes: list[RecordedEpisode] = []
-        self._histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
+        self._episodes: list[RecordedEpisode | ArmEpisode] = []
+        self._histograms = {key: empty_histogram() for key in videos_of(features)}
+        self._is_discarded = False
         self._dataset = new_dataset(
-            self._draft, features, encoder=encoder, max_frames=max_frames, robot=robot
+            self._draft, features, encoder=encoder, max_frames=max_frames, robot=robot, fps=fps
         )
 
     def __enter__(self) -> Self:
@@ -66,14 +70,28 @@ class ShardWriter:
                 f"{MIN_FRAMES}. Raise steps_after_success."
             )
         for frame in frames:
-            for key, histogram in self._histograms.items():
-                histogram += count_levels(frame[key])
-            self._dataset.add_frame({**frame, "task": episode.instruction})
-        self._dataset.save_episode()
+            self.add_frame(frame, episode.instruction)
+        self.save(episode)
+
+    def add_frame(self, frame: dict[str, Any], instruction: str) -> None:
+        """Encode a frame of an episode that `save` ends."""
+        for key, histogram in self._histograms.items():
+            histogram += count_levels(frame[key])
+        self._dataset.add_frame({**frame, "task": instruction})
+
+    def save(self, episode: RecordedEpisode | ArmEpisode) -> None:
+        """End an episode whose frames have been added."""
+        with _no_bars():
+            self._dataset.save_episode()
         self._episodes.append(episode)
 
+    def discard(self) -> None:
+        """Leave nothing behind at the end."""
+        self._is_discarded = True
+
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not None:
+        if kind is not None or self._is_discarded:
+            self._dataset.clear_episode_buffer()  # ends the threads that encode
             remove_drafts(self._path)
             return
         self._dataset.finalize()
@@ -83,6 +101,18 @@ class ShardWriter:
         publish(self._draft, self._path)
 
 
+@contextlib.contextmanager
+def _no_bars() -> Iterator[None]:
+    """Let `datasets` show no bar for an episode that is written in a moment: an operator reads here."""
+    were_shown = not are_progress_bars_disabled()
+    disable_progress_bars()
+    try:
+        yield
+    finally:
+        if were_shown:
+            enable_progress_bars()
+
+
 def new_dataset(
     root: Path,
     features: dict[str, Any],
@@ -90,12 +120,13 @@ def new_dataset(
     encoder: EncoderSettings,
     max_frames: int,
     robot: str = PANDA.name,
+    fps: int = FPS,
 ) -> Any:  # Any: lerobot's plain data, and lerobot
     """Return a new LeRobotDataset of these fields to write episodes of up to `max_frames` into."""
     av.logging.set_libav_level(av.logging.ERROR)  # else twenty lines for each video
     return LeRobotDataset.create(
         repo_id=f"local/{root.name}",
-        fps=FPS,
+        fps=fps,
         features=features,
         root=root,
         robot_type=robot,
@@ -111,16 +142,23 @@ def new_dataset(
     )
 
 
-def join_shards(shards: Sequence[Path], root: Path) -> tuple[RecordedEpisode, ...]:
+def videos_of(features: Mapping[str, Any]) -> list[str]:
+    """Return the fields that are videos."""
+    return [key for key, feature in features.items() if feature["dtype"] == "video"]
+
+
+def join_shards[E: RecordedEpisode | ArmEpisode](
+    shards: Sequence[Path], root: Path, cls: type[E]
+) -> tuple[E, ...]:
     """Put finished shards together as one new LeRobotDataset with exact statistics; return its episodes."""
     join_datasets(shards, root)
-    histograms = {key: empty_histogram() for key in CAMERA_KEYS.values()}
+    histograms: dict[str, Histogram] = {}
     for shard in shards:
         with np.load(shard / SHARD_HISTOGRAMS) as stored:
-            for key, histogram in histograms.items():
-                histogram += stored[key]
+            for key in stored:
+                histograms[key] = histograms.get(key, empty_histogram()) + stored[key]
     write_exact_statistics(root, histograms)
-    return tuple(episode for shard in shards for episode in shard_episodes(shard))
+    return tuple(episode for shard in shards for episode in read_entries(shard / SHARD_EPISODES, cls))
 
 
 def write_exact_statistics(root: Path, histograms: dict[str, Histogram]) -> None:
@@ -130,8 +168,3 @@ def write_exact_statistics(root: Path, histograms: dict[str, Histogram]) -> None
     statistics = {key: vector_statistics(rows.reshape(n_frames, -1)) for key, rows in columns.items()}
     images = {key: image_statistics(found, n_frames=n_frames) for key, found in histograms.items()}
     write_stats({**statistics, **images}, root)
-
-
-def shard_episodes(shard: Path) -> tuple[RecordedEpisode, ...]:
-    """Return the episodes of a finished shard."""
-    return read_entries(shard / SHARD_EPISODES, RecordedEpisode)

@@ -111,7 +111,7 @@ def join_dataset(job: JoinJob) -> DatasetFacts:
     home = job.shards[0].parent / job.path.name
     remove_drafts(home)
     draft = draft_path(home)
-    episodes = join_shards(job.shards, draft)
+    episodes = join_shards(job.shards, draft, RecordedEpisode)
     (draft / MIKASA_FOLDER).mkdir()
     write_lines(draft / MANIFEST_FILE, episodes)
     write_lines(draft / FAILED_FILE, job.failed)

@@ -8,12 +8,13 @@ import yaml
 from huggingface_hub import DatasetCard, DatasetCardData
 from numpy.typing import NDArray
 
-from vla_eval.control_modes import JOINT_DELTA_POS
+from vla_eval.control_modes import JOINT_DELTA_POS, MOTORS
 from vla_eval.data.exact_statistics import RESOLUTION, about_still_dimensions
 from vla_eval.data.facts import DatasetFacts, ImportFacts, MixtureFacts
 from vla_eval.data.manifest import MANIFEST_FILE
 from vla_eval.data.opening import OpenDataset, open_dataset
 from vla_eval.data.sharing.sheet import draw_sheet
+from vla_eval.errors import DatasetError
 from vla_eval.features import ACTION_KEY, CAMERA_KEYS, SUCCESS_KEY
 from vla_eval.results.cells import markdown_block, markdown_cell, markdown_code
 from vla_eval.storage.durable import replace_file
@@ -28,6 +29,11 @@ MAX_SEEDS_SHOWN = 40
 def write_card(root: Path, *, license_id: str | None = None) -> str:
     """Write card and contact sheet, and return the card's text; the licence is named as on the Hub."""
     dataset = open_dataset(root)
+    if dataset.facts.control_mode == MOTORS:
+        raise DatasetError(
+            f"{root}: expected demonstrations of a simulated task, found those of an arm: there is no card"
+            " for these yet. Write README.md by hand, and upload by `hf upload --repo-type dataset`."
+        )
     (root / SHEET_FILE).parent.mkdir(exist_ok=True)
     (root / SHEET_FILE).write_bytes(draw_sheet(dataset))
     text = _render(dataset, license_id=license_id)

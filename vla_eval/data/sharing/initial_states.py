@@ -9,7 +9,7 @@ import numpy as np
 
 from vla_eval.config.environment import Simulator
 from vla_eval.core import FloatArray, ImageArray
-from vla_eval.data.facts import DatasetFacts, MixtureFacts, find_facts
+from vla_eval.data.facts import DatasetFacts, ImportFacts, MixtureFacts, find_facts
 from vla_eval.data.foreign.convert import find_source
 from vla_eval.data.foreign.episodes import EEF_KEY, JOINTS_KEY, SOURCE_PROPRIO_KEY, Source, SourceEpisode
 from vla_eval.data.foreign.import_writer import eef_of_proprio
@@ -90,7 +90,7 @@ def _recorded_facts(source: Source) -> tuple[Sequence[int | None], str | None, S
         task = facts.task
         simulator = "fake" if facts.recipe.get("simulator") == "fake" else "maniskill"
         seeds = [episode.seed for episode in read_manifest(root)]
-    elif facts is not None:
+    elif isinstance(facts, ImportFacts):
         task = facts.task
         seeds = [episode.source_seed for episode in facts.episodes]
     if len(seeds) != n_episodes:

@@ -12,11 +12,11 @@ from typing import Any  # lerobot is untyped
 import numpy as np
 from numpy.typing import NDArray
 
+from vla_eval.control_modes import POSITION
 from vla_eval.core import ImageArray
 from vla_eval.errors import RobotBusError, RobotCameraError, RobotError
 from vla_eval.specs import CameraSpec
 
-POSITION = ".pos"  # LeRobot's ending of a motor's position
 CHANNELS = 3
 
 Motors = NDArray[np.float64]
@@ -110,13 +110,18 @@ class RobotLink:
             )
         return image.copy()
 
-    @contextlib.contextmanager
-    def _bus(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as exc:  # LeRobot's drivers raise what their libraries raise
-            said = " ".join(str(exc).split())
-            raise RobotBusError(
-                f"robot '{self.robot.name}', {doing}: {type(exc).__name__}: {said} Check cables and power, "
-                "then run the command again."
-            ) from exc
+    def _bus(self, doing: str) -> contextlib.AbstractContextManager[None]:
+        return device_errors("robot", self.robot.name, doing)
+
+
+@contextlib.contextmanager
+def device_errors(kind: str, name: str, doing: str) -> Iterator[None]:
+    """Turn whatever a device raises into a `RobotBusError`."""
+    try:
+        yield
+    except Exception as exc:  # LeRobot's drivers raise what their libraries raise
+        said = " ".join(str(exc).split())
+        raise RobotBusError(
+            f"{kind} '{name}', {doing}: {type(exc).__name__}: {said} Check cables and power, then run the "
+            "command again."
+        ) from exc

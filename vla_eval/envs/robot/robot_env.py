@@ -4,6 +4,7 @@ Knows LeRobot's robot by `RobotLink` alone. The arm is held still in all phases 
 policy says; an error stops it, and nothing moves before the next reset.
 """
 
+import dataclasses
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -55,6 +56,10 @@ class Station:
         pairs = zip(link.motors, here.tolist(), strict=True)
         home = np.array([settings.home.get(name, position) for name, position in pairs])
         return cls(link=link, operator=operator, settings=settings, clock=clock, units=units, home=home)
+
+    def driven(self, settings: RobotSettings) -> Self:
+        """Return the same arm, driven in another way, such as another control mode."""
+        return dataclasses.replace(self, settings=settings, units=Units.of(settings, self.link.motors))
 
 
 @dataclass(slots=True, kw_only=True)

@@ -14,10 +14,9 @@ from lerobot.robots.robot import Robot
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.real_robot import SIMULATED_TYPE
-from vla_eval.control_modes import JOINT_POS
+from vla_eval.control_modes import JOINT_POS, POSITION
 from vla_eval.core import ImageArray, SimEnv, StepResult
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.robot.link import POSITION
 from vla_eval.envs.robot.units import GRIPPER_OPEN
 from vla_eval.errors import SimulationError
 from vla_eval.features import IMAGE_SHAPE

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from vla_eval.config.real_robot import MOTORS, SIMULATED_TYPE, JointZero, RobotSettings
-from vla_eval.control_modes import JOINT_POS
+from vla_eval.config.real_robot import SIMULATED_TYPE, JointZero, RobotSettings
+from vla_eval.control_modes import JOINT_POS, MOTORS, POSITION
 from vla_eval.core import FloatArray
 from vla_eval.envs.robot.link import Motors
 from vla_eval.errors import RecipeError, check_names
@@ -73,7 +73,7 @@ class Units:
         if self.mode == JOINT_POS and self.arm is not None:
             return self.arm.actions[JOINT_POS]
         return ActionSpec(
-            dims=self.motors,
+            dims=self._fields,
             low=tuple(self.low.tolist()),
             high=tuple(self.high.tolist()),
             control_mode=MOTORS,
@@ -81,9 +81,14 @@ class Units:
         )
 
     @property
+    def _fields(self) -> tuple[str, ...]:
+        """The motors, as LeRobot's datasets name their positions."""
+        return tuple(f"{name}{POSITION}" for name in self.motors)
+
+    @property
     def states(self) -> tuple[StateSpec, ...]:
         """What is offered of the arm's state."""
-        own = StateSpec(name=MOTORS, dims=self.motors, unit="deg, gripper 0 to 100", frame="joint")
+        own = StateSpec(name=MOTORS, dims=self._fields, unit="deg, gripper 0 to 100", frame="joint")
         return (own,) if self.arm is None else (*states(self.arm.joints), own)
 
     def state(self, motors: Motors, before: Motors, *, control_hz: float) -> dict[str, FloatArray]:

@@ -11,8 +11,7 @@ from torch import Tensor
 from vla_eval.checkpoints.files import TrainingFacts
 from vla_eval.checkpoints.loading import LoadedPolicy
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
-from vla_eval.config.real_robot import MOTORS
-from vla_eval.control_modes import CONTROL_MODE
+from vla_eval.control_modes import CONTROL_MODE, MOTORS
 from vla_eval.core import Observation
 from vla_eval.errors import SpecMismatchError, did_you_mean
 from vla_eval.features import PROPRIO_STATES, STATE_KEY, StateKind, proprioception, state_names

@@ -22,7 +22,7 @@ from vla_eval.checkpoints.policy_types import asked_for_steps, chunk_size, histo
 from vla_eval.checkpoints.trained_with import Asked, differences, refuse_differences
 from vla_eval.core import ActionChunk, EpisodeStart, MemoryArrays, ObservationWindow
 from vla_eval.errors import InvalidActionError, SpecMismatchError
-from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY, StateKind
+from vla_eval.features import ACTION_KEY, CAMERA_KEYS, STATE_KEY, StateKind, camera_key
 from vla_eval.models.episodes.memory import memory_of, recall, remembers, remembers_in_rows, remembers_singly
 from vla_eval.models.episodes.named_memory import MemoryLayout
 from vla_eval.models.episodes.running import (
@@ -287,6 +287,11 @@ def _earlier_frames(config: Any) -> FrameMemory | None:
     return None if choice is None else FrameMemory(choice=choice, cameras=tuple(config.memory_cameras))
 
 
+def _default_cameras(context: PolicyContext) -> dict[str, str]:
+    """Return camera -> field of the datasets that are recorded with it."""
+    return {**CAMERA_KEYS, **{camera.name: camera_key(camera.name) for camera in context.env.cameras}}
+
+
 def make_lerobot(
     context: PolicyContext,
     *,
@@ -311,7 +316,9 @@ def make_lerobot(
     if compile:
         compile_network(loaded, policy=context.name)
     asked = InputOptions(
-        cameras=CAMERA_KEYS if cameras is None else cameras, state=state, absent_cameras=absent_cameras
+        cameras=_default_cameras(context) if cameras is None else cameras,
+        state=state,
+        absent_cameras=absent_cameras,
     )
     with plain_errors(loaded.folder, loaded.config.type, "cannot be used"):
         facts = read_facts(loaded.folder)
