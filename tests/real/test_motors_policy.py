@@ -29,12 +29,15 @@ MOTORS_ALONE = dataclasses.replace(
 )
 
 
-def write_policy(folder: Path, *, n_dims: int = 6) -> Path:
+FRONT = "observation.images.front"
+
+
+def write_policy(folder: Path, *, n_dims: int = 6, image: str = FRONT) -> Path:
     """Write an ACT of LeRobot's that returns positions near 0, and a recipe for it."""
     config = ACTConfig(
         input_features={
             "observation.state": PolicyFeature(type=FeatureType.STATE, shape=(n_dims,)),
-            "observation.images.front": PolicyFeature(type=FeatureType.VISUAL, shape=(3, 128, 128)),
+            image: PolicyFeature(type=FeatureType.VISUAL, shape=(3, 128, 128)),
         },
         output_features={"action": PolicyFeature(type=FeatureType.ACTION, shape=(n_dims,))},
         chunk_size=4,
@@ -51,15 +54,14 @@ def write_policy(folder: Path, *, n_dims: int = 6) -> Path:
     torch.manual_seed(0)
     ACTPolicy(config).save_pretrained(folder / "act")
     numbers = {name: torch.full((n_dims,), value) for name, value in (("mean", 0.0), ("std", 1.0))}
-    image = {name: torch.full((3, 1, 1), value) for name, value in (("mean", 0.5), ("std", 0.5))}
-    stats = {"observation.state": numbers, "action": numbers, "observation.images.front": image}
+    pixels = {name: torch.full((3, 1, 1), value) for name, value in (("mean", 0.5), ("std", 0.5))}
+    stats = {"observation.state": numbers, "action": numbers, image: pixels}
     for processor in make_pre_post_processors(config, dataset_stats=stats):
         processor.save_pretrained(folder / "act")
     recipe = folder / "mine.yaml"
     recipe.write_text(
         "version: 1\ndescription: d\nadapter: lerobot\ndefault_n_action_steps: 4\n"
-        f"args:\n  checkpoint: {folder / 'act'}\n  device: cpu\n"
-        "  cameras: {base_camera: observation.images.front}\n"
+        f"args:\n  checkpoint: {folder / 'act'}\n  device: cpu\n  cameras: {{base_camera: {image}}}\n"
     )
     return recipe
 

@@ -22,7 +22,7 @@ from vla_eval.checkpoints.notes import (
 from vla_eval.chunking import ChunkingSettings
 from vla_eval.config.files import Recipe, digest_of
 from vla_eval.config.policy import PolicyRecipe
-from vla_eval.control_modes import CONTROL_MODE
+from vla_eval.control_modes import CONTROL_MODE, MOTORS
 from vla_eval.core import BatchPolicy, Policy
 from vla_eval.episode_log import check_reads_committed
 from vla_eval.errors import RecipeError, SpecMismatchError, UnknownNameError
@@ -34,6 +34,7 @@ from vla_eval.policies.registry import POLICIES, PRIVILEGED, make_from_adapter
 from vla_eval.policies.remote.settings import ADAPTER as REMOTE_ADAPTER
 from vla_eval.robots.find import ROBOT
 from vla_eval.robots.rows import PANDA
+from vla_eval.serving.arm_env import arm_env
 from vla_eval.serving.observations import (
     PROMPT_WIRE_KEY,
     STATE_WIRE_KEY,
@@ -155,6 +156,8 @@ def _environment(recipe: Recipe[PolicyRecipe], options: HostOptions) -> EnvSpec:
     facts = read_facts(find_checkpoint(Path(checkpoint))) if is_ours and checkpoint else None
     if facts is None:
         return env_spec() if task is None else offered_by(task, {})
+    if facts.control_mode == MOTORS:
+        return arm_env(facts, task=ANY_TASK if task is None else task.id)
     sizes_px = {shape[0] for shape in facts.images.values()}
     size_px = sizes_px.pop() if len(sizes_px) == 1 else IMAGE_SIZE_PX
     robot = PANDA.name if facts.robot is None else facts.robot

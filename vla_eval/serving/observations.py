@@ -6,6 +6,7 @@ from typing import Any  # Any: what a client sends
 
 import numpy as np
 
+from vla_eval.control_modes import MOTORS
 from vla_eval.core import CommittedActions, FloatArray, ImageArray, Observation
 from vla_eval.errors import SpecMismatchError, VlaEvalError, did_you_mean, some_of
 from vla_eval.features import PROPRIO_STATES, STATE_NAMES
@@ -23,6 +24,8 @@ from vla_eval.wire.numbers import (
 CAMERA_WIRE_KEYS = {"base_camera": "observation/image", "hand_camera": "observation/wrist_image"}
 """Camera -> key of its image. Source: openpi's policy for LIBERO,
 https://github.com/Physical-Intelligence/openpi/blob/15a9616a00943ada6c20a0f158e3adb39df2ccac/src/openpi/policies/libero_policy.py"""
+IMAGE_WIRE_PREFIX = "observation/images/"
+"""Beginning of the key of another camera's image."""
 STATE_WIRE_KEY = "observation/state"
 PROMPT_WIRE_KEY = "prompt"
 
@@ -107,15 +110,20 @@ class ObservationReader:
 def observation_reader(policy: PolicySpec, env: EnvSpec, *, end_effector: bool) -> ObservationReader:
     """Return what reads the observations of a policy; `end_effector`: it also reads the kind `eef`."""
     sizes = {camera.name: (camera.height_px, camera.width_px) for camera in env.cameras}
+    keys = CAMERA_WIRE_KEYS
+    if env.action.control_mode == MOTORS:  # of an arm, whose cameras have names of their own
+        keys = {
+            camera.name: keys.get(camera.name, f"{IMAGE_WIRE_PREFIX}{camera.name}") for camera in env.cameras
+        }
     for camera in policy.cameras:
-        if camera not in CAMERA_WIRE_KEYS:
+        if camera not in keys:
             raise SpecMismatchError(
                 f"policy '{policy.name}' needs the camera '{camera}', which cannot be sent to a server "
-                f"(it takes: {', '.join(CAMERA_WIRE_KEYS)}).{did_you_mean(camera, CAMERA_WIRE_KEYS)}"
+                f"(it takes: {', '.join(keys)}).{did_you_mean(camera, keys)}"
             )
     dims = {state.name: state.dims for state in env.states}
     return ObservationReader(
-        cameras={name: CameraImage(CAMERA_WIRE_KEYS[name], *sizes[name]) for name in policy.cameras},
+        cameras={name: CameraImage(keys[name], *sizes[name]) for name in policy.cameras},
         states={name: dims[name] for name in policy.states},
         end_effector=end_effector,
         chunk_shape=(policy.chunk_size, len(env.action.dims)) if policy.reads_committed else None,
