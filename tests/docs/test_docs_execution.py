@@ -55,7 +55,9 @@ NOT_EXECUTED: Mapping[str, str] = {
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
     r"audit --stored-frames.*": "twenty episodes at least; tests/audit/test_stored_frames.py",
-    r"real --robot bench_3.yaml .*": "an arm; tests/envs/test_robot_env.py",
+    r"real (record )?--robot bench_3.yaml .*": "an arm; tests/envs/test_robot_env.py, tests/real",
+    r"dataset (check|adopt) data/so101": "a download; tests/data/test_arm_datasets.py",
+    r"real record .*|(real|finetune) .*act_shuffled.*": "minutes; tests/real/test_recorded_to_real.py",
     r"real .*--rehearse .*": "faults, which end with 3; tests/real/test_real_command.py",
     r"report .* --card .*": "a card of a checkpoint; tests/results/test_model_card.py",
     r"reproduce .*": "up to hundreds of episodes; tests/cli/test_reproduce.py",
