@@ -109,6 +109,7 @@ MISTAKES: dict[str, dict[str, str]] = {
         "real record --robot simulated_so10": "Did you mean 'simulated_so100'",
         "real record --robot simulated_so100 --policy oracle": "--policy is for `mikasa-vla real evaluate`",
         "real --robot simulated_so100 --policy oracle --keep all": "--keep is for `mikasa-vla real record`",
+        "real record --robot simulated_so100 --n-action-steps 0": "--n-action-steps is for",
         "real record --robot simulated_so100 --teleop lerobot": "Leave --teleop out",
         "real record --robot simulated_so100 --keep some": "successes",
         "real record --robot simulated_so100 --episodes 0": "--episodes",

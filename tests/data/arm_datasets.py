@@ -22,6 +22,7 @@ def write_so101(
     action_names: Sequence[str] | None = None,
     sentences: Sequence[str] = SENTENCES,
     fps: int = FPS,
+    seed: int = 0,
 ) -> Path:
     """Write one episode per sentence, without success, phases or records of ours."""
     sizes = {"observation.images.front": (48, 64, 3), "observation.images.wrist": (32, 64, 3)}
@@ -39,7 +40,7 @@ def write_so101(
     dataset = new_dataset(
         root, features, encoder=EncoderSettings(), max_frames=N_FRAMES, robot="so101_follower", fps=fps
     )
-    draws = np.random.default_rng(0)
+    draws = np.random.default_rng(seed)
     for sentence in sentences:
         for _ in range(N_FRAMES):
             numbers = {

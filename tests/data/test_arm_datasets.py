@@ -59,10 +59,14 @@ def test_adopted_it_is_trained_on_with_its_own_rate_and_cameras(tmp_path: Path) 
 
 
 def test_two_of_one_arm_are_mixed_at_their_own_rate(tmp_path: Path) -> None:
-    roots = [write_so101(tmp_path / name, sentences=[f"Pick the {name} cube"]) for name in ("red", "green")]
+    roots = [
+        write_so101(tmp_path / color, sentences=[f"Pick the {color} cube"], seed=seed)
+        for seed, color in enumerate(("red", "green"))
+    ]
     for root in roots:
         adopt(root, task=None)
     mix_datasets(roots, tmp_path / "both")
+    assert check(tmp_path / "both").said == ()
     job = training_job(dataclasses.replace(CONFIG, dataset=str(tmp_path / "both"), out=str(tmp_path / "run")))
     assert (job.facts.fps, job.facts.control_mode) == (30.0, "motors")
     assert open_dataset(tmp_path / "both").cameras == tuple(job.facts.images)

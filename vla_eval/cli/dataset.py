@@ -193,7 +193,7 @@ def _mix(args: argparse.Namespace) -> int:
     print(f"{args.out}: {len(facts.tasks)} tasks, {n_episodes} episodes, {facts.n_frames} frames")
     for sentence in facts.shared_scenes:
         print(f"note: {sentence}")
-    if not facts.was_replayed:
+    if not facts.was_replayed and facts.control_mode != MOTORS:
         names = ", ".join(source.name for source in facts.sources if not source.was_replayed)
         print(f"not replayed: {names}. `finetune` asks for --allow-unreplayed.")
     return 0

@@ -107,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.cli.terminal.progress import stop_on_signals
 
     for other, names in FLAGS_OF.items():
-        given = [name for name in names if getattr(args, name)]
+        given = [name for name in names if not (getattr(args, name) is None or getattr(args, name) is False)]
         if other != args.what and given:
             flag = {"policies": "policy"}.get(given[0], given[0]).replace("_", "-")
             raise RecipeError(

@@ -73,7 +73,7 @@ def check(path: Path) -> CheckReport:
         kind = "a LeRobotDataset with the fields of this project, without its records"
         if facts is not None and facts.is_checked:  # the rules were applied when it was made
             known = (Said("kept", sentence) for sentence in facts.kept)
-        elif demonstrations.of_an_arm:
+        elif demonstrations.of_an_arm and facts is None:
             known = (*known, *(Said("kept", sentence) for sentence in about_arm(demonstrations)))
             kind = "a LeRobotDataset of an arm's motors"
         return CheckReport(
