@@ -50,6 +50,7 @@ COMMANDS = {
     "audit": f"audit --task {TASK} --control hold --protocol paper --episodes 2 {FAKE} --out {{W}}/audit",
     "probe": f"probe --task {TASK} --policy cue_blind --episodes 2 {FAKE} --out {{W}}/probe",
     "real": "real --robot simulated_so100 --policy oracle --stage CubeVisible --episodes 1 --out {W}/real",
+    "real --teleop": "real record --robot simulated_so100 --stage CubeVisible --episodes 1 --out {W}/led",
     "view": f"view {{W}}/data/{TASK} --episode 0 --web",
     "dataset convert": f"dataset convert {{W}}/data/{TASK} --to npz --out {{W}}/npz",
     "dataset mix": f"dataset mix {{W}}/data/{TASK} {{W}}/data/RememberShape3-v0 --out {{W}}/mixed",

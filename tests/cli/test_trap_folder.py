@@ -44,7 +44,7 @@ WITH_LEROBOT = {
     *("record", "replay", "finetune", "train-agent", "doctor", "bench --loader", "bench --serve"),
     *("checkpoint verify", "checkpoint rehearse", "checkpoint merge"),
     *("checkpoint convert-octo", "checkpoint convert-openvla", "checkpoint convert-spatialvla"),
-    *("view", "serve", "real"),
+    *("view", "serve", "real", "real --teleop"),
     *(name for name in COMMANDS if name.startswith("dataset ")),
 }
 """Commands that import lerobot, which takes 10 s, or read what those have made."""
