@@ -52,6 +52,7 @@ def asked(policy: str, out: Path, settings: Any = ANGLES) -> Any:
     return evaluation(out, policy, settings=settings, stages=(STAGE,), n_action_steps=4)
 
 
+@pytest.mark.slow
 def test_it_drives_the_arm_as_it_was_trained_and_finds_its_camera(arms: Any, tmp_path: Path) -> None:
     running = session(arms(ANGLES), asked(f"mine={trained(tmp_path)}", tmp_path / "run"))
     (entry,) = running.evaluation.policies
