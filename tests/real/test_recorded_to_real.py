@@ -7,12 +7,15 @@ import time
 from pathlib import Path
 
 import pytest
+import yaml
 
 from tests.cli.every_verb import command_line, environment_of
 from vla_eval.checkpoints.files import find_checkpoint, read_facts
+from vla_eval.cli.main import main
 from vla_eval.data.facts import ArmFacts
 from vla_eval.data.opening import open_dataset
 from vla_eval.storage.run_folder import read_run
+from vla_eval.testing.tiny_models import TINY_POLICY, tiny_paligemma, write_tiny_tokenizer
 
 RECORD = (
     "real record --robot simulated_so100 --teleop scripted --operator scripted --episodes 2 --out {W}/data"
@@ -78,3 +81,32 @@ def test_a_policy_that_is_trained_on_a_recording_runs_on_the_arm(tmp_path: Path)
     # Each in the control mode of its own: the expert plans in angles of the arm's model.
     outcomes = {(one.policy, one.outcome) for one in read_run(tmp_path / "run").records}
     assert ("oracle", "success") in outcomes and "error" not in {outcome for _, outcome in outcomes}
+
+
+@pytest.mark.slow
+def test_a_tiny_pi05_that_is_trained_on_a_recording_runs_in_all_stages(
+    tmp_path: Path, no_network: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    arm = ["--robot", "simulated_so100", "--episodes", "1"]
+    assert main(["real", "record", *arm, "--stage", "CubeVisible", "--out", str(tmp_path / "data")]) == 0
+    recipe = tmp_path / "tiny_pi05.yaml"
+    section = {
+        "type": "pi05",
+        "tokenizer": str(write_tiny_tokenizer(tmp_path / "tokenizer")),
+        "policy": {**TINY_POLICY, "gradient_checkpointing": False, "scheduler_decay_steps": 4},
+        **{"steps": 2, "batch_size": 2, "save_every_steps": 2, "num_workers": 0},
+    }
+    text = {"version": 1, "description": "tiny", "adapter": "lerobot", "finetune": section}
+    recipe.write_text(yaml.safe_dump(text))
+    dataset, trained = tmp_path / "data" / "real_twin" / "CubeVisible-v0", str(tmp_path / "pi05")
+
+    with tiny_paligemma("pi05"):
+        words = ["--policy", str(recipe), "--dataset", str(dataset), "--device", "cpu", "--out", trained]
+        assert main(["finetune", *words]) == 0
+        assert main(["real", *arm, "--policy", trained, "--out", str(tmp_path / "run"), "--paper"]) == 0
+
+    records = read_run(tmp_path / "run").records
+    assert len(records) == 9
+    assert "error" not in {one.outcome for one in records}
+    assert min(one.n_inferences for one in records) > 1
