@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from tests.fuzz.json_cases import BYTES, VALUES, accepted_or_refused, as_bytes, near
 from vla_eval.data.dataset_folder import check_dataset
 from vla_eval.data.facts import (
+    ArmFacts,
     DatasetFacts,
     ImportedEpisode,
     ImportFacts,
@@ -23,6 +24,7 @@ from vla_eval.data.facts import (
 )
 from vla_eval.data.info_file import INFO_FILE, read_info
 from vla_eval.data.manifest import (
+    ARM_FILE,
     FAILED_FILE,
     IMPORT_FILE,
     MANIFEST_FILE,
@@ -30,6 +32,7 @@ from vla_eval.data.manifest import (
     MIXTURE_FILE,
     RECORDING_FILE,
     REPLAY_FILE,
+    ArmEpisode,
     FailedSeed,
     FileDigest,
     RecordedEpisode,
@@ -125,6 +128,32 @@ MIXTURE = MixtureFacts(
     files={"meta/info.json": EMPTY},
     vla_eval_version="1",
 )
+TRIAL = ArmEpisode(
+    number=3,
+    seed=3001,
+    instruction="pick it",
+    color="red",
+    places=(0, 1, 2),
+    cue_steps=21,
+    delay_steps=0,
+    n_steps=2,
+    success_step=None,
+    touched=("green",),
+)
+ARM = ArmFacts(
+    complete=True,
+    task="real/CubeVisible-v0",
+    robot="so101_follower",
+    settings={"max_step": 5},
+    leader="so101_leader",
+    teleop={"port": "/dev/ttyACM1"},
+    n_frames=2,
+    n_discarded=1,
+    episodes=(TRIAL,),
+    environment={"python": "3.12.1"},
+    files={"meta/info.json": EMPTY},
+    vla_eval_version="1",
+)
 FEATURE = {"dtype": "video", "shape": [128, 128, 3], "names": None}
 INFO = {
     **{"codebase_version": "v3.0", "robot_type": "panda", "fps": 20, "total_episodes": 1, "total_frames": 2},
@@ -140,6 +169,7 @@ WRITTEN: dict[Path, dict[str, Any]] = {
     REPLAY_FILE: json.loads(to_json(REPORT)),
     IMPORT_FILE: json.loads(json.dumps({"format_version": 1, **dataclasses.asdict(IMPORT)})),
     MIXTURE_FILE: json.loads(json.dumps({"format_version": 1, **dataclasses.asdict(MIXTURE)})),
+    ARM_FILE: json.loads(to_json(ARM)),
 }
 READERS: dict[Path, Callable[[Path], object]] = {
     MANIFEST_FILE: lambda root: [episode.action_rows() for episode in read_manifest(root)],
@@ -148,6 +178,7 @@ READERS: dict[Path, Callable[[Path], object]] = {
     REPLAY_FILE: read_replay,
     IMPORT_FILE: find_facts,
     MIXTURE_FILE: find_facts,
+    ARM_FILE: find_facts,
     INFO_FILE: read_info,
 }
 FILES = st.dictionaries(
@@ -178,6 +209,7 @@ def root(tmp_path: Path) -> Path:
         (REPLAY_FILE, REPORT),
         (IMPORT_FILE, IMPORT),
         (MIXTURE_FILE, MIXTURE),
+        (ARM_FILE, ARM),
         (INFO_FILE, INFO),
     ],
     ids=str,

@@ -8,7 +8,7 @@ import pytest
 
 from tests.real.recording_bench import ANSWER_STEPS, FakeLeader, Person, Recording
 from vla_eval.data.facts import ArmFacts
-from vla_eval.data.manifest import read_failed
+from vla_eval.data.manifest import FAILED_FILE, DiscardedTrial, read_entries
 from vla_eval.data.opening import open_dataset
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, TooManyErrorsError
 from vla_eval.real.demonstrations import Demonstrations
@@ -74,7 +74,9 @@ def test_what_was_not_picked_is_discarded_and_replaced(tmp_path: Path) -> None:
     recording.run()
     facts, trials = facts_of(tmp_path), recording.person.trials
     assert len(trials) == 3 + 1 and facts.n_discarded == 1
-    assert [one.seed for one in read_failed(tmp_path / TASK)] == [trials[1].number]
+    assert [one.number for one in read_entries(tmp_path / TASK / FAILED_FILE, DiscardedTrial)] == [
+        trials[1].number
+    ]
     assert [one.number for one in facts.episodes] == [trials[i].number for i in (0, 2, 3)]
     assert sorted(one.color for one in facts.episodes) == sorted(COLORS)
     assert any("Discarded" in line for line in recording.person.told)

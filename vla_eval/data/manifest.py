@@ -5,8 +5,8 @@
     recording.json  recipe, environment, counts, digest of every file; written last (see `facts`)
     replay.json     `ReplayReport`: what a replay of the stored actions found
 
-An imported dataset has `import.json` instead, one that was mixed of several `mixture.json`, and one of
-demonstrations on an arm `arm.json` and `failed.jsonl`.
+An imported dataset has `import.json` instead, one that was mixed of several `mixture.json`, one of
+demonstrations on an arm `arm.json` and, in `failed.jsonl`, a `DiscardedTrial` per episode that was not kept.
 
 A folder of its own, because lerobot drops keys of `info.json` that it does not know. Standard library
 and numpy only: it knows nothing of lerobot.
@@ -123,6 +123,14 @@ class ArmEpisode:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class DiscardedTrial:
+    """A trial on an arm whose episode was not kept."""
+
+    number: Positive  # in the plan
+    n_steps: Count
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FailedSeed:
     """A seed below the last kept one at which the expert did not succeed within the horizon."""
 
@@ -186,7 +194,11 @@ def from_json[E](cls: type[E], text: str | bytes, *, where: str) -> E:
     return as_dataclass(cls, data, source)
 
 
-def write_lines(path: Path, entries: Sequence[RecordedEpisode | ArmEpisode | FailedSeed]) -> None:
+type Entry = RecordedEpisode | ArmEpisode | DiscardedTrial | FailedSeed
+"""What the files with one entry per line hold."""
+
+
+def write_lines(path: Path, entries: Sequence[Entry]) -> None:
     """Write entries, one per line, whole or not at all."""
     replace_file(path, "".join(f"{to_json(entry)}\n" for entry in entries))
 
@@ -220,7 +232,7 @@ def read_replay(dataset: Path) -> ReplayReport | None:
     return from_json(ReplayReport, read_content(path), where=str(path)) if path.exists() else None
 
 
-def read_entries[E: RecordedEpisode | ArmEpisode | FailedSeed](path: Path, cls: type[E]) -> tuple[E, ...]:
+def read_entries[E: Entry](path: Path, cls: type[E]) -> tuple[E, ...]:
     """Return the entries of a file, one per line; raise `DatasetError` if it is missing or damaged."""
     data = read_content(path)
     if data and not data.endswith(b"\n"):

@@ -12,7 +12,7 @@ from pathlib import Path
 from vla_eval import __version__
 from vla_eval.core import EpisodeStart, FloatArray, Policy, StepObserver, StepResult
 from vla_eval.data.facts import ArmFacts
-from vla_eval.data.manifest import ArmEpisode, FailedSeed
+from vla_eval.data.manifest import ArmEpisode, DiscardedTrial
 from vla_eval.data.recording.arm import StageRecording
 from vla_eval.data.recording.demonstrations import phase_steps
 from vla_eval.data.recording.folder import RecordingFolder
@@ -181,7 +181,7 @@ class RecordingSession:
         if is_kept:
             store.add(trial.number)
         else:
-            store.discard(FailedSeed(seed=trial.number, n_steps=frames.n_steps))
+            store.discard(DiscardedTrial(number=trial.number, n_steps=frames.n_steps))
             self.say(
                 f"Discarded: the right cube was not marked as picked. Another {COLORS[trial.color]} episode "
                 f"of {trial.stage.name} takes its place ({len(store.discarded)} discarded so far)."

@@ -2,7 +2,7 @@
 
     OUT/TASK/                             a finished dataset of one stage; appears in one step
     OUT/recording/TASK/shards/shard-00007   the episode of trial 7, until the dataset is there
-    OUT/recording/TASK/discarded.jsonl    one `FailedSeed` per episode that was not kept
+    OUT/recording/TASK/discarded.jsonl    one `DiscardedTrial` per episode that was not kept
 
 The rest is as in `folder`. Knows nothing of arms and operators: frames and episodes come from above.
 """
@@ -19,7 +19,7 @@ from vla_eval.data.manifest import (
     FAILED_FILE,
     MIKASA_FOLDER,
     ArmEpisode,
-    FailedSeed,
+    DiscardedTrial,
     read_entries,
     to_json,
     write_entry,
@@ -46,10 +46,10 @@ class StageRecording:
         shards = (state / SHARDS).glob("shard-*")
         whole = [path for path in shards if path.suffix != DRAFT_SUFFIX]
         self.shards = {int(path.name.partition("-")[2]): path for path in sorted(whole)}
-        self.discarded: dict[int, FailedSeed] = {}
+        self.discarded: dict[int, DiscardedTrial] = {}
         if self._discarded_path.exists():
             cut_tail(self._discarded_path)
-            self.discarded = {one.seed: one for one in read_entries(self._discarded_path, FailedSeed)}
+            self.discarded = {one.number: one for one in read_entries(self._discarded_path, DiscardedTrial)}
 
     @property
     def path(self) -> Path:
@@ -82,15 +82,15 @@ class StageRecording:
         """Note that the episode of a trial has been written."""
         self.shards[number] = self._folder.shard(self.task, number)
 
-    def discard(self, episode: FailedSeed) -> None:
+    def discard(self, trial: DiscardedTrial) -> None:
         """Note that the episode of a trial was not kept; it is durable when this returns."""
         self._discarded_path.parent.mkdir(parents=True, exist_ok=True)
         file = LineFile(self._discarded_path, durable=True)
         try:
-            file.append(to_json(episode))
+            file.append(to_json(trial))
         finally:
             file.close()
-        self.discarded[episode.seed] = episode
+        self.discarded[trial.number] = trial
 
     def join(self, numbers: Sequence[int], facts: ArmFacts) -> ArmFacts:
         """Put the episodes of these trials together as the dataset; `facts` are without what they hold."""
