@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.estimates import Share, p_above
-from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable
+from vla_eval.results.printed_table import UNDEFINED, Column, PrintedTable, p_text
 from vla_eval.tasks.real_stages import CHANCE, COLORS, PAPER_EPISODES, STAGES, Rates, Stage, stage_of
 
 PAPER = "π0.5 (paper)"
@@ -120,7 +120,7 @@ def _notes(rows: Sequence[StageRow]) -> Iterator[str]:
         if row.touched is not None and (p := p_below(row.touched)) < 0.05:
             yield (
                 f"{row.policy} on {row.stage.name}: {row.touched.n} of {row.touched.of} touched is below "
-                f"chance (p = {p:.3f}, exact binomial test, one-sided): it does not guess, or does not get "
+                f"chance ({p_text(p)}, exact binomial test, one-sided): it does not guess, or does not get "
                 "to a cube."
             )
     if any(row.policy == PAPER for row in rows):

@@ -13,6 +13,11 @@ from vla_eval.results.latex import NEEDS, fitted, latex_table, latex_text
 UNDEFINED = "—"
 
 
+def p_text(p_value: float) -> str:
+    """Return a p value as a sentence has it: `p = 0.012`, `p < 0.001`."""
+    return "p < 0.001" if p_value < 0.001 else f"p = {p_value:.3f}"
+
+
 @dataclass(frozen=True, slots=True)
 class Column[R]:
     """One column of a table for reading."""

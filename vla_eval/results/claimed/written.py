@@ -6,6 +6,7 @@ from dataclasses import asdict
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.results.claimed.acceptance import Acceptance, Claim, Decision
 from vla_eval.results.claimed.claims import Claimed
+from vla_eval.results.printed_table import p_text
 
 
 def render_plan(
@@ -38,13 +39,9 @@ def render_decision(
     after = f"{found} against {test.claim}"
     if decision.verdict == "reproduced":
         return f"Reproduced within {test.loss:g}: {after}."
-    if decision.verdict == "below":
-        return f"Below the claim: {after}, {_p(decision.p_value)}."
+    if decision.p_value is not None:  # below the claim
+        return f"Below the claim: {after}, {p_text(decision.p_value)}."
     return f"Not decided after {decision.n_episodes} episodes: {after}."
-
-
-def _p(p_value: float | None) -> str:
-    return "" if p_value is None else "p < 0.001" if p_value < 0.001 else f"p = {p_value:.3f}"
 
 
 def _json(decision: Decision, claimed: Claimed, test: Acceptance, config: EvalConfig) -> dict[str, object]:
