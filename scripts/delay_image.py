@@ -18,7 +18,7 @@ from vla_eval.storage.run_folder import read_run
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")  # Okabe and Ito
 EXECUTIONS = {"skip": (":", "x"), "stale": ("-", "o"), "wait": ("--", "s"), "prefix": ("-.", "^")}
-WIDTH_IN, HEIGHT_IN, DPI = 3.2, 3.0, 150
+WIDTH_IN, HEIGHT_IN, LEGEND_IN, DPI = 4.5, 3.0, 1.5, 150
 Cells = dict[tuple[int, str, str], dict[int, Row]]
 
 
@@ -31,7 +31,7 @@ def main() -> None:
     figure, panels = plt.subplots(
         1,
         len(sizes),
-        figsize=(WIDTH_IN * len(sizes), HEIGHT_IN),
+        figsize=(WIDTH_IN * len(sizes) + LEGEND_IN, HEIGHT_IN),
         sharey=True,
         squeeze=False,
         layout="constrained",
@@ -59,7 +59,7 @@ def main() -> None:
         plt.Line2D([], [], color="0.4", linestyle=EXECUTIONS[one][0], marker=EXECUTIONS[one][1], label=one)
         for one in shown
     ]
-    figure.legend(handles=marks, loc="outside lower center", ncols=len(marks), frameon=False, fontsize=8)
+    figure.legend(handles=marks, loc="outside right center", frameon=False, fontsize=8)
     figure.savefig(target, dpi=DPI)
 
 
