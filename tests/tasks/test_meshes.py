@@ -16,11 +16,13 @@ from tests.tasks.made_tasks import make
 from tests.tasks.test_swapped_cue import held
 from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import describe_env, make_env
-from vla_eval.errors import RunChangedError, RunFolderError, TaskArgumentError
+from vla_eval.errors import RunChangedError, RunFolderError, TaskArgumentError, UnknownNameError
 from vla_eval.evaluation.evaluate import describe
 from vla_eval.evaluation.plan import make_plan
 from vla_eval.evaluation.resolve import resolve
 from vla_eval.records import EpisodeRecord
+from vla_eval.tasks.arguments import pinned
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.objects.bodies import pose_of
 from vla_eval.tasks.objects.item_names import THING_NAMES, item_names
 
@@ -194,3 +196,11 @@ def test_the_expert_finds_them_and_a_blind_arm_does_not(tmp_path: Path, kind: st
     assert success["oracle"] >= 19
     # At most as many as chance gives in all but 1 of 1,000 runs of 20: binomial(20, 1 / n_items).
     assert success["cue_blind"] <= {3: 13, 5: 10, 9: 8}[n_items]
+
+
+@pytest.mark.parametrize(
+    "task", ["RememberColor3-v0", "RememberShape3-v0", "ShellGameTouch-v0", "TakeItBack-v0"]
+)
+def test_a_task_that_takes_no_meshes_says_so_before_the_folder_is_looked_at(task: str) -> None:
+    with pytest.raises(UnknownNameError, match=f"env of {task}: there is no argument 'meshes'"):
+        pinned({"meshes": "nothing/is/there"}, [task_spec(task)])

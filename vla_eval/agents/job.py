@@ -71,7 +71,7 @@ def agent_job(config: AgentConfig) -> AgentJob:
     check_arguments(row, loaded.value.arguments)
     network_fields(row, loaded.value.network)
     recipe = in_whole_updates(loaded.value, row)
-    arguments = pinned(recipe.env)
+    arguments = pinned(recipe.env, [task])
     recipe = replace(recipe, env=without_path(arguments))
     settings = EnvSettings(
         task=task.id,

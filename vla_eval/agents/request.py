@@ -40,7 +40,7 @@ def look_for(config: AgentConfig) -> FinetuneSummary | None:
     step = newest_step(out)
     if config.held_out is not None or step == 0:
         return None
-    recipe = in_whole_updates(replace(recipe, env=without_path(pinned(recipe.env))), row)
+    recipe = in_whole_updates(replace(recipe, env=without_path(pinned(recipe.env, [task]))), row)
     asked = request_sha256(recipe, task.id, run_seed=config.run_seed)
     if step != recipe.steps or read_record(out).get(REQUEST_KEY) != asked:
         return None

@@ -18,6 +18,7 @@ from vla_eval.policies.recipe import bare_policy
 from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.storage.shard import Shard, shard_folder
 from vla_eval.tasks.arguments import pinned
+from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.objects.mesh_folder import without_path
 from vla_eval.workers.backend import Backend
 from vla_eval.workers.local import LOCAL
@@ -51,7 +52,7 @@ class ResolvedEvaluation:
         """Decide where policies infer; arguments as for `resolve`, with the policies that were read."""
         if config.compile:
             policies = _compiled(policies)
-        config = replace(config, env=pinned(config.env))
+        config = replace(config, env=pinned(config.env, [task_spec(task) for task in config.tasks]))
         if config.inference == "auto":
             config = replace(
                 config, inference="shared" if _shares(config, policies, backend) else "in_process"

@@ -148,12 +148,16 @@ def meshes_of(given: Mapping[str, Any]) -> "MeshSet | None":  # Any: plain data
     return read_meshes(arguments[MESHES], scale=arguments["mesh_scale"], allow_holes=arguments["mesh_holes"])
 
 
-def pinned(given: Mapping[str, Any]) -> dict[str, Any]:  # Any: plain data
+def pinned(given: Mapping[str, Any], tasks: Sequence[TaskSpec]) -> dict[str, Any]:  # Any: plain data
     """Return arguments in which a folder of meshes, if any, has its whole path and the digest of its files.
 
     Raises:
         TaskArgumentError: it is not there, or one of its meshes cannot be used.
+        UnknownNameError: one of the tasks takes none.
     """
+    for spec in tasks if MESHES in given else ():
+        if not (spec.is_official or spec.is_base):
+            _check_names_and_types(spec, given)
     found = meshes_of(given)
     return dict(given) if found is None else {**given, MESHES: found.pinned}
 

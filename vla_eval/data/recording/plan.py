@@ -42,10 +42,10 @@ def plan_recording(recipe: DatasetRecipe) -> RecordingPlan:
     expert = load_recipe("policies", recipe.expert, PolicyRecipe)
     check_adapter(expert.value.adapter)
     prompts = load_prompts(recipe.prompt_set)
-    env = pinned(recipe.env)
+    specs = [robot_task(task, does="`record` makes demonstrations of") for task in recipe.tasks]
+    env = pinned(recipe.env, specs)
     recipe = replace(recipe, env=without_path(env))
     meshes = meshes_of(env)
-    specs = [robot_task(task, does="`record` makes demonstrations of") for task in recipe.tasks]
     return RecordingPlan(
         recipe=recipe,
         tasks=tuple(_task_plan(recipe, env, expert, sentences_of(prompts, spec)[0], spec) for spec in specs),
