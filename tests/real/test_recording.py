@@ -10,6 +10,7 @@ from tests.real.recording_bench import ANSWER_STEPS, FakeLeader, Person, Recordi
 from vla_eval.data.facts import ArmFacts
 from vla_eval.data.manifest import FAILED_FILE, DiscardedTrial, read_entries
 from vla_eval.data.opening import open_dataset
+from vla_eval.data.recording.arm import StageRecording
 from vla_eval.errors import DatasetError, RecordingError, RunChangedError, TooManyErrorsError
 from vla_eval.real.demonstrations import Demonstrations
 from vla_eval.real.plan import demonstration_trials, make_plan
@@ -50,6 +51,30 @@ def test_a_stage_becomes_a_dataset_of_motors_with_its_phases(tmp_path: Path) -> 
     assert success.tolist() == columns["next.done"][first].reshape(-1).tolist() == [False] * 5 + [True]
     said = {one.instruction for one in facts_of(tmp_path, "real/CubeVisible-v0").episodes}
     assert said == {f"Pick the {color} cube" for color in COLORS}
+
+
+def test_a_stage_that_is_finished_is_not_recorded_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    stages = (stage_of("CubeVisible"), stage_of("CubesThrownIn"))
+    join = StageRecording.join
+
+    def killed(store: StageRecording, *args: Any) -> ArmFacts:
+        if store.task == TASK:
+            raise KeyboardInterrupt
+        return join(store, *args)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(StageRecording, "join", killed)
+        Recording(tmp_path, stages=stages).run()
+    finished = facts_of(tmp_path, "real/CubeVisible-v0")
+
+    again = Recording(tmp_path, stages=stages)
+    again.run()
+
+    assert again.person.trials == []
+    assert facts_of(tmp_path, "real/CubeVisible-v0") == finished
+    assert len(facts_of(tmp_path).episodes) == len(COLORS)
 
 
 def test_the_arm_is_held_and_then_comes_to_the_leader_by_steps(tmp_path: Path) -> None:

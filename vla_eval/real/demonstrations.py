@@ -79,18 +79,16 @@ class Demonstrations:
         """Return the trials whose episodes are used, and the next one to record; None: all are there.
 
         Args:
-            kept: name of a stage -> numbers of the trials whose episodes are kept.
+            kept: name of a stage -> numbers of the trials whose episodes are kept; others are finished.
             tried: numbers of those whose episodes were discarded.
         """
         used: list[Trial] = []
-        missing = {
-            (stage.name, color): self.episodes for stage in self.stages for color in range(len(COLORS))
-        }
+        missing = {(name, color): self.episodes for name in kept for color in range(len(COLORS))}
         for trial in demonstration_trials(self.stages, seed=self.seed):
             if not any(missing.values()):
                 break
             row = (trial.stage.name, trial.color)
-            if not missing[row] or trial.number in tried:
+            if not missing.get(row) or trial.number in tried:
                 continue
             if trial.number not in kept[trial.stage.name]:
                 return used, trial

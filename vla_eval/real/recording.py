@@ -113,15 +113,15 @@ class RecordingSession:
             RobotBusError: the arm does not come back after a fault.
             OperatorError: the operator does not want to continue.
         """
-        asked, n_errors = self.asked, 0
+        asked = self.asked
         description = asked.describe(command=command)
         with RecordingFolder.open(
             asked.out, description, allow_environment_change=allow_environment_change
         ) as folder:
             stages = {stage.name: StageRecording(folder, asked.task(stage)) for stage in asked.stages}
-            if not all(one.is_finished for one in stages.values()):
-                n_errors = self._record_missing(stages)
-                self._join(stages)
+            open_ones = {name: one for name, one in stages.items() if not one.is_finished}
+            n_errors = self._record_missing(open_ones)
+            self._join(open_ones)
             datasets = {one.path: one.facts() for one in stages.values()}
         for path, facts in datasets.items():
             self._check_number(path, facts)
@@ -130,7 +130,7 @@ class RecordingSession:
     def _record_missing(self, stages: Mapping[str, StageRecording]) -> int:
         """Record episodes until all are there; return how many ended in an error."""
         n_errors = n_in_row = n_discarded_in_row = 0
-        total = self.asked.n_episodes
+        total = self.asked.episodes * len(COLORS) * len(stages)
         while True:
             used, trial = self._chosen(stages)
             if trial is None:
@@ -190,12 +190,9 @@ class RecordingSession:
 
     def _join(self, stages: Mapping[str, StageRecording]) -> None:
         """Make the datasets that are not there yet."""
-        used, _ = self._chosen({name: one for name, one in stages.items() if not one.is_finished})
+        used, _ = self._chosen(stages)
         asked = self.asked
-        for stage in asked.stages:
-            store = stages[stage.name]
-            if store.is_finished:
-                continue
+        for name, store in stages.items():
             self.say(f"{store.path}: putting the episodes together")
             facts = ArmFacts(
                 complete=True,
@@ -211,7 +208,7 @@ class RecordingSession:
                 files={},
                 vla_eval_version=__version__,
             )
-            store.join([trial.number for trial in used if trial.stage == stage], facts)
+            store.join([trial.number for trial in used if trial.stage.name == name], facts)
 
     def _check_number(self, path: Path, facts: ArmFacts) -> None:
         expected, found = self.asked.episodes * len(COLORS), len(facts.episodes)
