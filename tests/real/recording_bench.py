@@ -28,12 +28,17 @@ class FakeLeader:
         self.positions = list(positions)
         self.is_connected, self.is_calibrated, self.n_connected = False, True, 0
         self.n_reads_to_fault: int | None = None
+        self.is_gone = False  # from the fault on it cannot be disconnected, either
 
     def connect(self, calibrate: bool = True) -> None:
-        self.is_connected, self.n_reads_to_fault = True, None
+        if self.n_connected:
+            self.n_reads_to_fault, self.is_gone = None, False
+        self.is_connected = True
         self.n_connected += 1
 
     def disconnect(self) -> None:
+        if self.is_gone:
+            raise ConnectionError("no such port")
         self.is_connected = False
 
     def get_action(self) -> dict[str, Any]:

@@ -132,6 +132,13 @@ def test_a_fault_is_recorded_again_and_the_arm_stays(tmp_path: Path) -> None:
     assert recording.arm.sent[4] == recording.arm.sent[3]
 
 
+def test_a_leader_that_cannot_be_disconnected_any_more_is_connected_again(tmp_path: Path) -> None:
+    leader = FakeLeader(99.0, 99.0, 99.0)
+    leader.n_reads_to_fault, leader.is_gone = 4, True
+    recorded = Recording(tmp_path, leader=leader).run()
+    assert recorded.n_errors == 1 and leader.n_connected == 2
+
+
 def test_too_many_faults_in_a_row_end_it(tmp_path: Path) -> None:
     recording = Recording(tmp_path)
     recording.arm.changes = {"front": None}

@@ -59,8 +59,7 @@ class TeleopLeader:
 
     def reconnect(self) -> None:
         """Connect it again."""
-        self._link.disconnect()
-        self._link.connect()
+        self._link.reconnect()
 
 
 class _Led:

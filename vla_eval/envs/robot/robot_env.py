@@ -277,7 +277,7 @@ class RobotEnv:
         )
 
     def _observation(self, reading: Reading, before: Motors, *, step: int) -> Observation:
-        station, robot = self._station, self._station.link.robot
+        station, robot = self._station, self._station.link.device
         hz = station.settings.control_hz
         return Observation(
             step=step,
