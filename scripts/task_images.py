@@ -56,7 +56,7 @@ MESHES = "meshes"  # name of the image of nine meshes made by trimesh
 OF_MESHES = "RememberObject9-v0"
 
 
-def picture(task: str, **kwargs: Any) -> np.ndarray:
+def sheet_of(task: str, **kwargs: Any) -> np.ndarray:
     """Return the (H, W, 3) uint8 RGB sheet of a task: a column per step, base view over wrist view."""
     env = ManiSkillEnv(EnvSettings(task=task, kwargs=kwargs, cameras=CAMERAS, privileged=True))
     chunking = ChunkingSpec(n_action_steps=1)
@@ -99,7 +99,7 @@ def of_meshes() -> np.ndarray:
     with tempfile.TemporaryDirectory() as folder:
         for name, mesh in toys().items():
             mesh.export(Path(folder) / f"{name}.glb")
-        return picture(OF_MESHES, meshes=folder, image_size=CLUTTERED_PX)
+        return sheet_of(OF_MESHES, meshes=folder, image_size=CLUTTERED_PX)
 
 
 def toys() -> dict[str, trimesh.Trimesh]:
@@ -141,7 +141,7 @@ def main() -> None:
         if name == MESHES:
             columns = [of_meshes()]
         else:
-            columns = [cluttered(task) for task in CLUTTERED] if name == CLUTTER else [picture(name)]
+            columns = [cluttered(task) for task in CLUTTERED] if name == CLUTTER else [sheet_of(name)]
         sheet = cv2.cvtColor(np.concatenate(columns, axis=1), cv2.COLOR_RGB2BGR)
         cv2.imwrite(str(folder / f"{name}.png"), sheet, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
