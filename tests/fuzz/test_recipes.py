@@ -57,7 +57,7 @@ def use(recipe: Recipe[Any]) -> None:
     assert decode(type(value), stored, where="stored") == value
     match value:
         case EvalConfig() if value.episodes * value.runs <= FEW_EPISODES:
-            fingerprint(value)
+            outcome(lambda: fingerprint(value))
             outcome(lambda: make_plan(value))
         case DatasetRecipe():
             outcome(lambda: plan_recording(value))
@@ -93,6 +93,18 @@ def test_every_kind_of_recipe_is_among_the_cases(folder: Folder, recipe: Path) -
     for text in shipped(folder):
         recipe.write_text(text, encoding="utf-8")
         assert any(outcome(lambda cls=cls: load_recipe(folder, "own.yaml", cls)) for cls in CLASSES[folder])
+
+
+@pytest.mark.parametrize(
+    "changed",
+    [{"tasks": ("RememberColour3-v0",)}, {"policies": ("orracle",)}, {"env": {"meshes": "nowhere"}}],
+    ids=str,
+)
+def test_what_only_a_look_outside_the_file_refuses(changed: dict[str, Any]) -> None:
+    """These are read as text; tasks, policies and folders are looked up when the recipe is used."""
+    value = EvalConfig(**({"name": "x", "tasks": ("RememberObject3-v0",), "policies": ("oracle",)} | changed))
+    assert outcome(lambda: fingerprint(value)) is None
+    use(Recipe(name="x", path=Path("x.yaml"), sha256="0" * 64, value=value))
 
 
 class TestCommandLine:
