@@ -72,7 +72,7 @@ def test_the_memory_of_an_agent_is_complete_and_typed(algorithm: str, agents: Pa
         return make_agent(context, checkpoint=str(agents / algorithm))
 
     policy = make()
-    assert policy.spec.has_memory is (algorithm == "ppo_lstm")
+    assert policy.spec.has_memory is (algorithm in ("ppo_lstm", "imitation"))
 
     def acts(policy: AgentPolicy, steps: range) -> list[Any]:
         return [
@@ -88,7 +88,9 @@ def test_the_memory_of_an_agent_is_complete_and_typed(algorithm: str, agents: Pa
         other.set_memory(0, memory)
         assert acts(other, range(n_before, 6)) == acts(policy, range(n_before, 6))
         for name, part in memory.items():
-            for wrong in ({name: part}, {**memory, name: part[0]}, {**memory, name: part.astype(np.float64)}):
+            others = {other: memory[other] for other in memory if other != name}
+            wrongs = (others, {**others, f"{name}s": part}, {**others, name: part[0]})
+            for wrong in (*wrongs, {**others, name: part.astype(np.float64)}):
                 with pytest.raises(SpecMismatchError, match="set_memory: expected"):
                     other.set_memory(0, wrong)
 

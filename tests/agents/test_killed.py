@@ -14,7 +14,9 @@ from tests.forked import run_forked
 from vla_eval.config.files import to_data
 
 STEP, WRITING = "in a step", "while a checkpoint is written"
-# Of 24 steps; the first checkpoint is written after 8, the second after 16.
+# Of 48 steps, asked at each step of two environments; an imitation at each step, and while the expert plays.
+# The first checkpoint is written at step 16, the second at 32.
+N_ASKED = {"imitation": 22}
 SCRIPT = """
 import os, signal
 from vla_eval.agents import checkpoints
@@ -26,7 +28,7 @@ asked = []
 
 def in_a_step():
     asked.append(None)
-    if {moment!r} == "in a step" and len(asked) == 13:
+    if {moment!r} == "in a step" and len(asked) == {n_asked}:
         os.kill(os.getpid(), signal.SIGKILL)
     return False
 
@@ -53,7 +55,8 @@ def test_a_killed_training_is_resumed_with_the_weights_of_one_that_was_not(
     algorithm: str, moment: str, tmp_path: Path
 ) -> None:
     config = tiny(algorithm, tmp_path / "run")
-    done = run_forked(SCRIPT.format(moment=moment, config=to_data(config)), tmp_path)
+    script = SCRIPT.format(moment=moment, config=to_data(config), n_asked=N_ASKED.get(algorithm, 13))
+    done = run_forked(script, tmp_path)
     assert done.returncode == -signal.SIGKILL, done.stderr
     found = [folder.name for folder in (tmp_path / "run/train/checkpoints").glob("[0-9.]*")]
     assert sorted(found) == [".partial-000000032", "000000016"][moment != WRITING :]

@@ -36,6 +36,13 @@ TINY: dict[str, dict[str, Any]] = {
         },
         "network": {"net_arch": [8]},
     },
+    "imitation": {
+        "n_envs": 2,
+        "steps": 48,
+        "save_every_steps": 16,
+        "arguments": {"demonstrations": 3, "batch_size": 2, "action_noise": 0.0},
+        "network": {"core": "gru", "width": 8},
+    },
 }
 
 

@@ -4,9 +4,11 @@ import tempfile
 import time
 from contextlib import closing
 from pathlib import Path
+from typing import Any  # the library's models
 
 import numpy as np
 
+from vla_eval.agents.expert import Expert
 from vla_eval.agents.job import agent_job
 from vla_eval.agents.train import described, environments, make_model, one_thread
 from vla_eval.config.agents import AgentConfig
@@ -30,6 +32,8 @@ def describe_training(config: AgentConfig) -> list[str]:
     ):
         model = make_model(job, envs)
         lines = described(job, model)
+        if envs.expert is not None:
+            return [*lines, _demonstrations_take(model, envs.expert), f"run folder: {job.out}"]
         begun, n_steps = time.monotonic(), 0
         envs.reset()
         while time.monotonic() - begun < MEASURED_SECONDS:
@@ -43,3 +47,16 @@ def describe_training(config: AgentConfig) -> list[str]:
         "comes on top (the training says how long it takes after its first update)",
         f"run folder: {job.out}",
     ]
+
+
+def _demonstrations_take(model: Any, expert: Expert) -> str:
+    begun, n_played = time.monotonic(), 0
+    for batch in expert.demonstrations(model.n_demonstrations, noise=model.action_push):
+        n_played += len(batch)
+        if time.monotonic() - begun > MEASURED_SECONDS:
+            break
+    minutes = (time.monotonic() - begun) / max(1, n_played) * model.n_demonstrations / 60
+    return (
+        f"time: the demonstrations take {minutes:.1f} min here, again at each resume; how long gradient "
+        "steps take the training says after the first ones"
+    )

@@ -57,7 +57,7 @@ class AgentJob:
     @property
     def steps_per_update(self) -> int:
         """Steps of all environments together between two changes of the weights."""
-        return self.recipe.n_envs * steps_per_update(self.algorithm, self.recipe.arguments)
+        return steps_per_update(self.algorithm, self.recipe.arguments, n_envs=self.recipe.n_envs)
 
 
 def agent_job(config: AgentConfig) -> AgentJob:
@@ -96,7 +96,8 @@ def agent_job(config: AgentConfig) -> AgentJob:
         asked_steps=loaded.value.steps,
         algorithm=row,
         task=task.id,
-        settings=replace(settings, cameras=reader.cameras, privileged=reader.privileged),
+        # the expert that is imitated reads true states
+        settings=replace(settings, cameras=reader.cameras, privileged=reader.privileged or row.imitates),
         env=env,
         reader=reader,
         device=_device(config.device, reader),

@@ -58,6 +58,8 @@ class Progress(BaseCallback):
         shown = [f"step {step:,}/{steps:,}"]
         if "episode_return" in line:
             shown.append(f"return {float(line['episode_return']):.3g}, success {float(line['success']):.2f}")
+        elif self._job.algorithm.imitates:
+            shown.append(f"loss {float(line['loss']):.3g}")
         shown.append(f"{rate:,.0f} steps/s, {(steps - step) / max(rate, 1e-9) / 60:.0f} min left")
         self._say("  ".join(shown))
 

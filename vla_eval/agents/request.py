@@ -52,7 +52,7 @@ def run_folder_of(config: AgentConfig) -> Path:
     if config.out is not None:
         return Path(config.out)
     name = task_spec(config.task).id.replace("/", "-")
-    return Path("runs") / f"{Path(config.policy).stem}-{name}-{config.run_seed}"
+    return Path("runs") / f"{config.label or Path(config.policy).stem}-{name}-{config.run_seed}"
 
 
 def request_sha256(recipe: AgentRecipe, task: str, *, run_seed: int) -> str:
@@ -62,7 +62,7 @@ def request_sha256(recipe: AgentRecipe, task: str, *, run_seed: int) -> str:
 
 def in_whole_updates(recipe: AgentRecipe, row: Algorithm) -> AgentRecipe:
     """Return it with steps in whole updates: the library does no half ones."""
-    unit = recipe.n_envs * steps_per_update(row, recipe.arguments)
+    unit = steps_per_update(row, recipe.arguments, n_envs=recipe.n_envs)
     save = rounded_up(recipe.save_every_steps, unit)
     return replace(recipe, steps=rounded_up(recipe.steps, unit), save_every_steps=save)
 

@@ -1,4 +1,4 @@
-"""Several trainings by rewards in one call: recipes × tasks × run seeds, and the evaluation of all."""
+"""Several trainings of agents in one call, of each recipe, task and run seed, and the evaluation of all."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -76,7 +76,7 @@ def _evaluation(configs: Sequence[AgentConfig]) -> dict[str, Any]:  # Any: plain
         )
     runs: dict[tuple[str, str], list[str]] = {}
     for one in configs:
-        name = Path(one.policy).stem.removesuffix("_base")
+        name = one.label or Path(one.policy).stem.removesuffix("_base")
         runs.setdefault((name, task_spec(one.task).id), []).append(str(one.out))
     policies = [f"{name}:{task}={','.join(folders)}" for (name, task), folders in runs.items()]
     simulator = recipes[0].simulator

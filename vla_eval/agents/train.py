@@ -19,6 +19,7 @@ import torch
 
 from vla_eval.agents.checkpoints import load_checkpoint, write_checkpoint
 from vla_eval.agents.curve import draw_curve
+from vla_eval.agents.expert import Expert
 from vla_eval.agents.job import AgentJob, agent_job
 from vla_eval.agents.progress import Progress, quiet_logger
 from vla_eval.agents.request import request_sha256
@@ -77,7 +78,7 @@ def train_agent(
         is_finished = newest_step(job.out) >= job.recipe.steps
         if held_out is not None and held_out.missing(read_metrics(job.out)):
             is_finished = False
-        draw_curve(job.out, list(read_metrics(job.out)), name=job.name, task=job.task)
+        _draw(job)
     return FinetuneSummary(out=job.out, step=newest_step(job.out), is_finished=is_finished)
 
 
@@ -94,7 +95,7 @@ def _train(job: AgentJob, say: Say, held_out: HeldOut | None, is_stopping: Calla
             if not _segment(job, model, envs, progress):
                 return
             checkpoint = write_checkpoint(job, model)
-            draw_curve(job.out, list(read_metrics(job.out)), name=job.name, task=job.task)
+            _draw(job)
             if held_out is not None and held_out.is_due(int(checkpoint.name)) and not is_stopping():
                 held_out.evaluate(checkpoint)
 
@@ -175,17 +176,19 @@ def _done(made: list[Any], job: AgentJob) -> float:
 
 def environments(job: AgentJob, *, logs: Path) -> SlotsEnv:
     """Return the environments of a training, side by side; processes of theirs write to `logs`."""
+    env = simulators(
+        job.settings,
+        workers=job.workers,
+        is_robot=not task_spec(job.task).is_base,
+        logs=logs,
+    )
     return SlotsEnv(
-        simulators(
-            job.settings,
-            workers=job.workers,
-            is_robot=not task_spec(job.task).is_base,
-            logs=logs,
-        ),
+        env,
         job.reader,
         n_slots=job.recipe.n_envs,
         reward=job.recipe.reward,
         run_seed=job.run_seed,
+        expert=Expert.of(job, env) if job.algorithm.imitates else None,
     )
 
 
@@ -211,9 +214,14 @@ def described(job: AgentJob, model: Any) -> list[str]:
     n_weights = sum(weight.numel() for weight in model.policy.parameters())
     shapes = ", ".join(f"{name} {part.shape}" for name, part in model.observation_space.items())
     steps, recipe = job.recipe.steps, job.recipe
+    agent = f"agent: {recipe.algorithm}, {n_weights:,} weights; given '{job.reader.mode}' ({shapes})"
+    if job.algorithm.imitates:
+        return [
+            f"{agent}; {model.n_demonstrations:,} demonstrations",
+            f"steps: {steps:,} gradient steps, each of {model.batch_size} demonstrations",
+        ]
     lines = [
-        f"agent: {recipe.algorithm}, {n_weights:,} weights; given '{job.reader.mode}' ({shapes}); "
-        f"{recipe.reward} reward",
+        f"{agent}; {recipe.reward} reward",
         f"steps: {steps:,} of {recipe.n_envs} environments, weights change every {job.steps_per_update:,}",
     ]
     if steps != job.asked_steps:
@@ -235,6 +243,11 @@ def _buffer_bytes(model: Any) -> int:
         for part in value.values() if isinstance(value, dict) else (value,):
             found += part.nbytes if isinstance(part, np.ndarray) else 0
     return found
+
+
+def _draw(job: AgentJob) -> None:
+    lines = list(read_metrics(job.out))
+    draw_curve(job.out, lines, name=job.name, task=job.task, imitates=job.algorithm.imitates)
 
 
 def _held_out(job: AgentJob, say: Say, is_stopping: Callable[[], bool]) -> HeldOut | None:

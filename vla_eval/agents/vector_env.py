@@ -9,6 +9,7 @@ from typing import Any  # the library's infos and indices
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from vla_eval.agents.expert import Expert
 from vla_eval.config.agents import TRAINING_SEEDS, Rewards
 from vla_eval.core import SimEnv, StepResult
 from vla_eval.policies.agents.observing import Reader, Seen, action_space, as_action, space_of
@@ -34,10 +35,23 @@ def reward_of(result: StepResult, kind: Rewards) -> float:
 
 
 class SlotsEnv(VecEnv):
-    """The slots of an environment; an episode that its rules do not end is *truncated* at the horizon."""
+    """The slots of an environment; an episode that its rules do not end is *truncated* at the horizon.
 
-    def __init__(self, env: SimEnv, reader: Reader, *, n_slots: int, reward: Rewards, run_seed: int) -> None:
+    `expert`: who plays in it for an algorithm that imitates; None for others.
+    """
+
+    def __init__(
+        self,
+        env: SimEnv,
+        reader: Reader,
+        *,
+        n_slots: int,
+        reward: Rewards,
+        run_seed: int,
+        expert: Expert | None = None,
+    ) -> None:
         self._env, self._reader, self._reward, self._run_seed = env, reader, reward, run_seed
+        self.expert = expert
         self._segment = 0
         self._n_begun = [0] * n_slots
         self._episodes = [EpisodeTotals() for _ in range(n_slots)]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from vla_eval.cli.terminal.progress import StopRequest
     from vla_eval.training.request import FinetuneSummary
 
-DESCRIPTION = """Train an agent by rewards, without demonstrations: PPO, PPO-LSTM, SAC (stable-baselines3).
+DESCRIPTION = """Train an agent by rewards (PPO, PPO-LSTM, SAC: stable-baselines3) or by imitation.
 
 --algorithm takes the recipe of that name that fits the task; --policy NAME takes another one in policies/
 with a `train_agent` section, for example ppo_published. CONFIG is a file with fields `policy`, `task`,
@@ -47,7 +47,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description, parser.epilog = DESCRIPTION, EPILOG
     parser.add_argument("config", nargs="?", metavar="CONFIG", help="file, or name in configs/")
     which = parser.add_mutually_exclusive_group()
-    which.add_argument("--algorithm", **MANY, dest="algorithms", metavar="A", help="ppo, ppo_lstm, sac")
+    which.add_argument(
+        "--algorithm", **MANY, dest="algorithms", metavar="A", help="ppo, ppo_lstm, sac, imitation"
+    )
     which.add_argument(
         "--policy",
         **MANY,
@@ -63,7 +65,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--reward", metavar="R", help="dense, sparse (the recipe's)")
     parser.add_argument(
-        "--steps", type=int, metavar="N", help="control steps of all environments (the recipe's)"
+        "--steps",
+        type=int,
+        metavar="N",
+        help="control steps of all environments; of an imitation, gradient steps (the recipe's)",
     )
     parser.add_argument("--n-envs", type=int, metavar="E", help="environments side by side (the recipe's)")
     parser.add_argument(
@@ -138,7 +143,7 @@ def _run_several(args: argparse.Namespace, configs: list[AgentConfig], command: 
     own = of_shard(placed, args.shard)
     if args.dry_run:
         # Run seeds take as long as each other.
-        once = {(one.policy, one.task): one for one in reversed(own)}
+        once = {(one.policy, one.label, one.task): one for one in reversed(own)}
         for one in reversed(once.values()):
             _describe(one)
         print(f"trainings: {len(own)}, of which {len(once)} are described, one per recipe and task")
@@ -179,10 +184,11 @@ def _configs(args: argparse.Namespace) -> list[AgentConfig]:
     named = args.algorithms or args.policies or ([None] if table is None else table.policies)
     tasks = args.tasks or ([None] if table is None else table.tasks)
     run_seeds = args.run_seeds or ([None] if table is None else table.run_seeds)
-    start = None if table is None else table.shared()
+    variants: list[str | None] = [None] if table is None else [*table.variants] or [None]
     return [
-        _config(args, name, task, run_seed, start=start)
+        _config(args, name, task, run_seed, start=None if table is None else table.of_variant(variant))
         for name in named
+        for variant in variants
         for task in tasks
         for run_seed in run_seeds
     ]

@@ -4,12 +4,13 @@ from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 from vla_eval.config.environment import Simulator
-from vla_eval.config.files import recipe_fields
-from vla_eval.config.finetuning import HeldOutConfig
+from vla_eval.config.files import check_run_name, recipe_fields
+from vla_eval.config.finetuning import HeldOutConfig, merge_fields
+from vla_eval.errors import RecipeError
 from vla_eval.strict.bounds import Slots, TrainingSteps, Workers, check_bounds, check_seeds, require
 from vla_eval.strict.devices import check_device
 
-Algorithm = Literal["ppo", "ppo_lstm", "sac"]
+Algorithm = Literal["ppo", "ppo_lstm", "sac", "imitation"]
 Observed = Literal["state", "vector", "rgb_joints", "image"]
 Rewards = Literal["dense", "sparse"]
 
@@ -47,6 +48,7 @@ class AgentConfig:
     policy: str  # name of a recipe in `policies/` that has a `train_agent` section
     task: str
     out: str | None = None  # the run folder; None: `runs/POLICY-TASK-SEED`
+    label: str | None = None  # what it is called in folders and tables; None: the recipe's name
     run_seed: int = 0  # of initial weights, exploration, and the seeds of the training's episodes
     # fields of the recipe's section, set to other values; Any: decoded as an AgentRecipe
     train_agent: dict[str, Any] = field(default_factory=dict)
@@ -58,11 +60,16 @@ class AgentConfig:
         check_bounds(self)
         check_seeds(self.run_seed, name="run_seed")
         check_device(self.device)
+        if self.label is not None:
+            check_run_name(self.label)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentTable:
-    """Several trainings, as `mikasa-vla train-agent CONFIG` reads them: each recipe, task and run seed."""
+    """Several trainings, as `mikasa-vla train-agent CONFIG` reads them.
+
+    Each recipe, in each variant, for each task and run seed.
+    """
 
     name: str
     policies: tuple[str, ...]  # recipes
@@ -71,22 +78,38 @@ class AgentTable:
     run_seeds: tuple[int, ...] = (0,)
     # as in `AgentConfig`, for each of them
     train_agent: dict[str, Any] = field(default_factory=dict)  # Any: decoded as an AgentRecipe
+    # name -> what it changes of the recipe's section, on top of `train_agent`; none: the recipes as they are
+    variants: dict[str, dict[str, Any]] = field(default_factory=dict)  # Any: likewise
     device: str = "auto"
     workers: Workers = "auto"
     held_out: HeldOutConfig | None = None
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        for name in self.variants:
+            check_run_name(name)
         for name in ("policies", "tasks", "run_seeds"):
             found = getattr(self, name)
             require(bool(found) and len(set(found)) == len(found), name, list(found), "some, none twice")
+        if self.variants and len(self.policies) > 1:
+            raise RecipeError(
+                f"variants: expected one recipe in `policies`, whose variants they are, found "
+                f"{', '.join(self.policies)}. Give the others a file of their own."
+            )
 
-    def shared(self) -> dict[str, Any]:  # Any: plain data of YAML
-        """Return what is the same in all trainings, as their configurations have it."""
-        same = {"train_agent": dict(self.train_agent), "device": self.device, "workers": self.workers}
+    def of_variant(self, name: str | None) -> dict[str, Any]:  # Any: plain data of YAML
+        """Return what is the same in all trainings of a variant, as their configurations have it."""
+        changes = {} if name is None else self.variants[name]
+        same: dict[str, Any] = {
+            "train_agent": merge_fields(self.train_agent, changes),
+            "device": self.device,
+            "workers": self.workers,
+            **({} if name is None else {"label": name}),
+        }
         return same if self.held_out is None else {**same, "held_out": asdict(self.held_out)}
 
 
 def is_agent_table(name: str) -> bool:
     """Whether a configuration is of several trainings; errors are those of `recipe_fields`."""
-    return {"run_seeds", "rows"} & recipe_fields("configs", name) == {"run_seeds"}
+    fields = recipe_fields("configs", name)
+    return "rows" not in fields and not fields.isdisjoint({"run_seeds", "variants"})

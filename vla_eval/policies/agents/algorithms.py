@@ -12,6 +12,9 @@ from vla_eval.strict.json_text import WORDS
 INSTALL = "Install it with `make rl`, or pip install 'mikasa-vla-eval[rl]'."
 
 
+_NETWORK_FIELDS = ("net_arch", "activation", "log_std_init", "ortho_init")
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Algorithm:
     """One algorithm."""
@@ -21,10 +24,17 @@ class Algorithm:
     # the network with several inputs: the library's name for it, or `module:Class`
     network: str
     recipes: Mapping[str, str]  # "robot", "base" -> the recipe that is meant without --policy
-    steps: str  # the argument that says after how many steps per environment weights change
-    extras: tuple[str, ...] = ()  # further fields of the network that a recipe may set
+    # the argument that says after how many steps per environment weights change; None: a step is a gradient
+    # step, and what is learned from is what the scripted expert does
+    steps: str | None
+    fields: tuple[str, ...] = _NETWORK_FIELDS  # of the network, that a recipe may set
     fits_discrete: bool = True  # it can choose among discrete actions
     replays: bool = False  # it learns from a buffer of earlier steps
+
+    @property
+    def imitates(self) -> bool:
+        """Whether it learns from demonstrations, not from rewards."""
+        return self.steps is None
 
 
 _ROWS = (
@@ -41,7 +51,10 @@ _ROWS = (
         network="vla_eval.policies.agents.lstm:WholeSequences",
         recipes={"robot": "ppo_lstm", "base": "ppo_lstm_base"},
         steps="n_steps",
-        extras=("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm", "lstm_forget_bias"),
+        fields=(
+            *_NETWORK_FIELDS,
+            *("lstm_hidden_size", "n_lstm_layers", "shared_lstm", "enable_critic_lstm", "lstm_forget_bias"),
+        ),
     ),
     Algorithm(
         name="sac",
@@ -51,6 +64,14 @@ _ROWS = (
         steps="train_freq",
         fits_discrete=False,
         replays=True,
+    ),
+    Algorithm(
+        name="imitation",
+        code="vla_eval.agents.imitation:Imitation",
+        network="vla_eval.policies.agents.imitator:CoreNetwork",
+        recipes={"robot": "imitation", "base": "imitation_base"},
+        steps=None,
+        fields=("core", "width", "layers", "heads", "context_steps", "dropout", "core_options"),
     ),
 )
 ALGORITHMS: Mapping[str, Algorithm] = {row.name: row for row in _ROWS}
@@ -65,7 +86,6 @@ OWN = frozenset(
     {"policy", "env", "policy_kwargs", "seed", "device", "verbose", "tensorboard_log", "_init_setup_model"}
 )
 """Arguments of the library's classes that the training sets itself."""
-_NETWORK_FIELDS = ("net_arch", "activation", "log_std_init", "ortho_init")
 _ACTIVATIONS = ("tanh", "relu", "elu", "gelu")
 
 
@@ -79,7 +99,18 @@ def algorithm(name: str) -> Algorithm:
 
 def library_class(row: Algorithm) -> Any:
     """Return the class of an algorithm."""
-    module, _, name = row.code.partition(":")
+    return _imported(row, row.code)
+
+
+def network_class(row: Algorithm) -> Any:
+    """Return the class of an algorithm's network."""
+    if ":" in row.network:
+        return _imported(row, row.network)
+    return library_class(row).policy_aliases[row.network]
+
+
+def _imported(row: Algorithm, target: str) -> Any:
+    module, _, name = target.partition(":")
     try:
         return getattr(importlib.import_module(module), name)
     except ModuleNotFoundError as exc:
@@ -90,15 +121,10 @@ def library_class(row: Algorithm) -> Any:
         ) from exc
 
 
-def network_class(row: Algorithm) -> Any:
-    """Return the class of an algorithm's network."""
-    code = library_class(row)  # first: its package may be missing
-    module, colon, name = row.network.partition(":")
-    return getattr(importlib.import_module(module), name) if colon else code.policy_aliases[row.network]
-
-
-def steps_per_update(row: Algorithm, arguments: Mapping[str, Any]) -> int:
-    """Return after how many steps of one environment the weights change."""
+def steps_per_update(row: Algorithm, arguments: Mapping[str, Any], *, n_envs: int) -> int:
+    """Return after how many steps of all environments together the weights change."""
+    if row.steps is None:
+        return 1
     found = arguments.get(row.steps)
     if found is None:
         found = inspect.signature(library_class(row).__init__).parameters[row.steps].default
@@ -106,7 +132,7 @@ def steps_per_update(row: Algorithm, arguments: Mapping[str, Any]) -> int:
         raise RecipeError(
             f"train_agent.arguments.{row.steps} is {found!r}, expected a whole number of steps, 1 or more."
         )
-    return found
+    return n_envs * found
 
 
 def check_arguments(row: Algorithm, arguments: Mapping[str, Any]) -> None:
@@ -136,7 +162,7 @@ def network_fields(row: Algorithm, network: Mapping[str, Any]) -> dict[str, Any]
     """Return the fields of a network as the library takes them."""
     import torch
 
-    check_names("field", network, (*_NETWORK_FIELDS, *row.extras), where="train_agent.network")
+    check_names("field", network, row.fields, where="train_agent.network")
     fields = dict(network)
     activation = fields.pop("activation", None)
     if activation is not None:

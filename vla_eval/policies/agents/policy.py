@@ -1,6 +1,6 @@
-"""The adapter `agent`: an agent trained by rewards, one inference per step, its memory per episode."""
+"""The adapter `agent`: what `mikasa-vla train-agent` trained; an inference per step, a memory per episode."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any  # the library's networks and what they remember
 
@@ -9,14 +9,16 @@ import numpy as np
 from vla_eval.checkpoints.bases import no_weights
 from vla_eval.checkpoints.files import find_checkpoint
 from vla_eval.checkpoints.trained_with import refuse_differences
-from vla_eval.core import ActionChunk, EpisodeStart, FloatArray, MemoryArrays, ObservationWindow
+from vla_eval.core import ActionChunk, EpisodeStart, MemoryArrays, ObservationWindow
 from vla_eval.errors import SpecMismatchError
+from vla_eval.policies.agents.imitator import CoreNetwork
 from vla_eval.policies.agents.network import AgentNetwork, load_network, read_about
 from vla_eval.policies.agents.observing import action_space, as_action, reader_of
 from vla_eval.policies.context import PolicyContext
 from vla_eval.specs import PolicySpec
 
 LSTM_STATE = ("policy/hidden", "policy/cell")
+"""Names of what the library's LSTM keeps, each (layers, 1, units) float32."""
 
 
 class AgentPolicy:
@@ -27,8 +29,7 @@ class AgentPolicy:
         self._read, self._network, self._about = reader.read, network, about
         self._action, self._task = context.env.action, context.env.task
         self._memory: dict[int, Any] = {}
-        # (layers, 1, units) of a network that remembers
-        self._memory_shape: tuple[int, ...] | None = getattr(network, "lstm_hidden_state_shape", None)
+        self._begun = _begun(network)
         self.spec = PolicySpec(
             name=context.name,
             reads="every",
@@ -36,7 +37,7 @@ class AgentPolicy:
             states=reader.states,
             chunk_size=about.chunk_size,
             privileged=reader.privileged,
-            has_memory=self._memory_shape is not None,
+            has_memory=bool(self._begun),
         )
 
     def reset(self, episodes: Sequence[EpisodeStart]) -> None:
@@ -49,23 +50,19 @@ class AgentPolicy:
         for slot in slots:
             self._memory.pop(slot, None)
 
-    def get_memory(self, slot: int) -> dict[str, FloatArray]:
-        """Return the state of the actor's LSTM, each part (layers, 1, units) float32; nothing without one."""
-        if self._memory_shape is None:
+    def get_memory(self, slot: int) -> dict[str, np.ndarray[Any, Any]]:
+        """Return what the network keeps: the state of an LSTM, the parts of a core; nothing of others."""
+        if not self._begun:
             return {}
-        begun = [np.zeros(self._memory_shape, np.float32)] * len(LSTM_STATE)
-        kept = self._memory[slot] or begun
-        return {name: np.array(part) for name, part in zip(LSTM_STATE, kept, strict=True)}
+        kept = self._memory[slot] or self._begun.values()
+        return {name: np.array(part) for name, part in zip(self._begun, kept, strict=True)}
 
     def set_memory(self, slot: int, memory: MemoryArrays) -> None:
         """Put a memory in place of that of a slot's episode."""
-        expected = {} if self._memory_shape is None else dict.fromkeys(LSTM_STATE, self._memory_shape)
-        found = {
-            name: part.shape if part.dtype == np.float32 else part.dtype for name, part in memory.items()
-        }
+        expected, found = _kinds(self._begun), _kinds(memory)
         if found != expected:
             raise SpecMismatchError(
-                f"policy '{self.spec.name}', set_memory: expected float32 {expected}, found {found}. Give it "
+                f"policy '{self.spec.name}', set_memory: expected {expected}, found {found}. Give it "
                 "what `get_memory` of the same policy returned."
             )
         self._memory[slot] = tuple(np.array(memory[name]) for name in expected) or None
@@ -89,6 +86,18 @@ class AgentPolicy:
         if found != expected:
             line = f"inputs: expected {expected} (trained on {self._about.task}), found {found}."
             refuse_differences([line], policy=self.spec.name, task=self._task)
+
+
+def _begun(network: Any) -> Mapping[str, np.ndarray[Any, Any]]:
+    """Return the memory that an episode begins with, by name; none of a network without."""
+    if isinstance(network, CoreNetwork):
+        return network.begun()
+    shape = getattr(network, "lstm_hidden_state_shape", None)
+    return {} if shape is None else {name: np.zeros(shape, np.float32) for name in LSTM_STATE}
+
+
+def _kinds(memory: MemoryArrays) -> dict[str, str]:
+    return {name: f"{part.dtype} {part.shape}" for name, part in memory.items()}
 
 
 def make_agent(context: PolicyContext, *, checkpoint: str | None = None) -> AgentPolicy:

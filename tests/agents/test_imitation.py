@@ -1,0 +1,180 @@
+"""An imitation learns what its expert did in episodes that were like the agent's, with any core."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+pytest.importorskip("stable_baselines3", reason="needs `make rl`")
+
+from tests.agents.tiny_agents import BIT, ROBOT, tiny, trained
+from vla_eval.agents.expert import Expert
+from vla_eval.agents.imitation import Demonstrations
+from vla_eval.agents.job import agent_job
+from vla_eval.agents.train import environments, train_agent
+from vla_eval.cli.main import main
+from vla_eval.config.agents import AgentTable, is_agent_table
+from vla_eval.config.files import load_recipe
+from vla_eval.errors import RecipeError, TrainingError, VlaEvalError
+from vla_eval.models.sequence.sizes import CORES
+from vla_eval.policies.agents.imitator import CoreNetwork
+from vla_eval.policies.agents.observing import VECTOR, action_space, given_space
+from vla_eval.storage.run_folder import read_run
+
+pytestmark = pytest.mark.usefixtures("in_this_process", "light_workers")
+SIZES = {"width": 16, "layers": 2, "heads": 2, "context_steps": 4}
+FEW = {"elmur": {"slots": 4, "experts": 2}}
+
+
+def expert(out: Path, task: str, **changes: Any) -> Expert:
+    job = agent_job(tiny("imitation", out, task, **changes))
+    found = environments(job, logs=out / "logs").expert
+    assert found is not None
+    return found
+
+
+def network(core: str, task: str, out: Path, n_inputs: int = 5) -> CoreNetwork:
+    torch.manual_seed(0)
+    action = action_space(agent_job(tiny("imitation", out, task)).env.action)
+    sizes = {**SIZES, "core": core, "core_options": FEW.get(core, {})}
+    return CoreNetwork(given_space({VECTOR: (n_inputs,)}), action, None, **sizes).eval()
+
+
+@pytest.mark.parametrize("task", [pytest.param(ROBOT, marks=pytest.mark.slow), BIT])
+@pytest.mark.parametrize("core", CORES)
+def test_step_by_step_a_core_answers_what_it_was_taught_at_once(core: str, task: str, tmp_path: Path) -> None:
+    made = network(core, task, tmp_path)
+    inputs = torch.randn(1, 11, 5, generator=torch.Generator().manual_seed(1))
+    made.set_statistics(inputs[0])
+    with torch.inference_mode():
+        at_once, _ = made(inputs, made.core.begin(1))
+    expected = at_once[0].split(made.counts, dim=-1) if made.counts else at_once[0].clamp(-1, 1)
+    state = None
+    for step in range(11):
+        seen = {VECTOR: inputs[:, step].numpy()}
+        action, state = made.predict(
+            seen, state=state, episode_start=np.array([step == 0]), deterministic=True
+        )
+        wanted = [int(part[step].argmax()) for part in expected] if made.counts else expected[step].tolist()
+        np.testing.assert_allclose(action[0], wanted, atol=1e-4)
+
+
+def test_what_is_learned_is_what_the_agent_would_see_and_the_expert_asked_for(tmp_path: Path) -> None:
+    """Of MemoryLength: the bit is shown first, and named at the end; the horizon is 11."""
+    (batch,) = expert(tmp_path / "run", BIT).demonstrations(2, noise=0.0)
+    assert [inputs.shape[0] for inputs, _ in batch] == [actions.shape[0] for _, actions in batch] == [11, 11]
+    assert all(actions[-1, 0] in (0, 1) for _, actions in batch)
+    (again,) = expert(tmp_path / "again", BIT).demonstrations(2, noise=0.0)
+    for one, other in zip(batch, again, strict=True):
+        np.testing.assert_array_equal(one[0], other[0])
+        np.testing.assert_array_equal(one[1], other[1])
+    (other_seed,) = expert(tmp_path / "other", BIT, run_seed=1).demonstrations(2, noise=0.0)
+    assert any((one[0] != other[0]).any() for one, other in zip(batch, other_seed, strict=True))
+
+
+def test_padding_teaches_nothing() -> None:
+    short, long = (
+        (np.ones((2, 3), np.float32), np.ones((2, 1), np.float32)),
+        (
+            np.full((5, 3), 2, np.float32),
+            np.zeros((5, 1), np.float32),
+        ),
+    )
+    found = Demonstrations.of([short, long])
+    assert found.is_step.sum(dim=1).tolist() == found.n_steps.tolist() == [2, 5]
+    assert found.inputs[0, :2].min() == 1 and found.inputs[1].min() == 2
+
+
+@pytest.mark.parametrize(
+    ("task", "changes", "error", "message"),
+    [
+        (BIT, {"arguments": {"action_noise": 0.1}}, RecipeError, "has no arm to push"),
+        (ROBOT, {"observation": "rgb_joints"}, RecipeError, "is given images"),
+        (BIT, {"network": {"core": "grru"}}, VlaEvalError, "Did you mean 'gru'"),
+        (
+            BIT,
+            {"network": {"core": "transformer", "width": 10, "heads": 4}},
+            RecipeError,
+            "a multiple of heads=4",
+        ),
+        (
+            BIT,
+            {"network": {"core": "gru", "core_options": {"keep_bas": 1}}},
+            VlaEvalError,
+            "Did you mean 'keep_bias'",
+        ),
+        (BIT, {"network": {"net_arch": [8]}}, VlaEvalError, "net_arch"),
+        (BIT, {"network": {"width": 0}}, VlaEvalError, "width"),
+        (BIT, {"arguments": {"demonstrations": True}}, RecipeError, "expected a whole number"),
+        (BIT, {"arguments": {"batch_size": 0}}, RecipeError, "batch_size is 0, expected"),
+        (BIT, {"arguments": {"demonstrations": 0}}, RecipeError, "demonstrations is 0, expected"),
+    ],
+)
+def test_a_mistake_is_one_message(
+    task: str, changes: dict[str, Any], error: type[VlaEvalError], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=message):
+        train_agent(tiny("imitation", tmp_path / "run", task, train_agent=changes))
+
+
+def test_an_expert_that_fails_too_often_ends_the_training(tmp_path: Path) -> None:
+    """The response begins at step 10: in two more steps nothing is reached."""
+    changes = {"env": {"horizon_steps": 12}, "arguments": {"demonstrations": 2}}
+    with pytest.raises(TrainingError, match="the expert succeeded in 0 of 10 episodes, and 2 demonstrations"):
+        train_agent(tiny("imitation", tmp_path / "run", train_agent=changes))
+
+
+def test_a_gru_learns_a_bit_and_an_mlp_does_not(tmp_path: Path) -> None:
+    returns = {}
+    for core in ("gru", "mlp"):
+        fields = {
+            "steps": 120,
+            "save_every_steps": 120,
+            "n_envs": 16,
+            "arguments": {"demonstrations": 64, "batch_size": 32, "learning_rate": 0.005},
+            "network": {"core": core, "width": 32},
+        }
+        run = trained(tiny("imitation", tmp_path / core, BIT, train_agent=fields))
+        assert (run / "curve.png").read_bytes().startswith(b"\x89PNG")
+        command = ["eval", "--task", BIT, "--policy", str(run), "--episodes", "40", "--workers", "1"]
+        assert main([*command, "--out", str(tmp_path / f"{core}-evaluated")]) == 0
+        records = read_run(tmp_path / f"{core}-evaluated").records
+        returns[core] = float(np.mean([record.episode_return for record in records]))
+    assert returns["gru"] == 1.0
+    assert abs(returns["mlp"]) < 0.5  # 0 by chance, with a standard deviation of 0.16
+
+
+def test_the_two_tables_of_the_ladder_have_the_same_cores() -> None:
+    tables = [load_recipe("configs", f"ladder_{end}", AgentTable).value for end in ("base", "robots")]
+    assert tables[0].variants == tables[1].variants
+    assert {one["network"]["core"] for one in tables[0].variants.values()} == set(CORES)
+    assert all(is_agent_table(f"ladder_{end}") for end in ("base", "robots"))
+
+
+def test_variants_are_trained_beside_each_other_and_named_in_the_evaluation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    sizes = "steps: 16, save_every_steps: 16, n_envs: 2, arguments: {demonstrations: 2, batch_size: 2}"
+    table = f"""name: mine
+policies: [imitation_base]
+tasks: [{BIT}]
+train_agent: {{{sizes}}}
+variants:
+  small: {{network: {{width: 4}}}}
+  large: {{network: {{width: 8}}, arguments: {{batch_size: 1}}}}
+"""
+    Path("mine.yaml").write_text(table, encoding="utf-8")
+    assert main(["train-agent", "mine.yaml", "--out", "out"]) == 0
+    assert {path.name for path in Path("out").iterdir() if path.is_dir()} == {
+        "small-mikasa_base-MemoryLengthEasy-v0-0",
+        "large-mikasa_base-MemoryLengthEasy-v0-0",
+    }
+    said = Path("out/eval.yaml").read_text(encoding="utf-8")
+    assert "small:mikasa_base/MemoryLengthEasy-v0=" in said and "large:" in said
+    Path("mine.yaml").write_text(table.replace("_base]", "_base, ppo_base]"), encoding="utf-8")
+    capsys.readouterr()
+    assert main(["train-agent", "mine.yaml", "--out", "out"]) == 1
+    assert "expected one recipe in `policies`" in " ".join(capsys.readouterr().err.split())
