@@ -14,7 +14,7 @@ from tests.forked import run_forked
 from vla_eval.config.files import to_data
 
 STEP, WRITING = "in a step", "while a checkpoint is written"
-# Of 48 steps, asked at each step of two environments; an imitation at each step, and while the expert plays.
+# Of 48 steps, asked at each step of two environments; an imitation at each step, and while the expert acts.
 # The first checkpoint is written at step 16, the second at 32.
 N_ASKED = {"imitation": 22}
 SCRIPT = """

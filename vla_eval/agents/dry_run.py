@@ -50,12 +50,12 @@ def describe_training(config: AgentConfig) -> list[str]:
 
 
 def _demonstrations_take(model: Any, expert: Expert) -> str:
-    begun, n_played = time.monotonic(), 0
+    begun, n_acted = time.monotonic(), 0
     for batch in expert.demonstrations(model.n_demonstrations, noise=model.action_push):
-        n_played += len(batch)
+        n_acted += len(batch)
         if time.monotonic() - begun > MEASURED_SECONDS:
             break
-    minutes = (time.monotonic() - begun) / max(1, n_played) * model.n_demonstrations / 60
+    minutes = (time.monotonic() - begun) / max(1, n_acted) * model.n_demonstrations / 60
     return (
         f"time: the demonstrations take {minutes:.1f} min here, again at each resume; how long gradient "
         "steps take the training says after the first ones"

@@ -1,4 +1,4 @@
-"""Demonstrations of a training that imitates: the scripted expert plays in the training's environments."""
+"""Demonstrations of a training that imitates: the scripted expert acts in the training's environments."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -25,7 +25,7 @@ DEMONSTRATION, ORDER = 0, 1
 """What is drawn for an imitation, apart from all that belongs to a checkpoint."""
 ENOUGH_TRIES = 4  # so many times the demonstrations asked for; an expert that needs more is none
 
-Played = tuple[FloatArray, FloatArray]
+Demonstration = tuple[FloatArray, FloatArray]
 """What an agent would have been given in an episode, (T, inputs), and what the expert asked for, (T, A)."""
 
 
@@ -46,7 +46,7 @@ class _Logs(StepObserver):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Expert:
-    """The expert of a task, and where it plays."""
+    """The expert of a task, and where it acts."""
 
     env: SimEnv
     policy: Policy
@@ -81,8 +81,8 @@ class Expert:
             instruction="" if task.is_base else instruction_for(task),
         )
 
-    def demonstrations(self, n: int, *, noise: float) -> Iterator[list[Played]]:
-        """Play until there are `n`, and yield them as they come.
+    def demonstrations(self, n: int, *, noise: float) -> Iterator[list[Demonstration]]:
+        """Act until there are `n`, and yield them as they come.
 
         A robot's end at their first success, and those without one are left out; others are kept as they are.
 
@@ -112,7 +112,7 @@ class Expert:
             n_kept, n_tried = n_kept + len(found), n_tried + self.n_slots
             yield found
 
-    def _batch(self, acting: SimEnv, first: int) -> list[Played]:
+    def _batch(self, acting: SimEnv, first: int) -> list[Demonstration]:
         logs = _Logs()
         starts = [self._start(slot, first + slot) for slot in range(self.n_slots)]
         settings = RolloutSettings(chunking=ONE_BY_ONE, stop_at_success=not self.is_base)
@@ -132,7 +132,7 @@ class Expert:
             horizon_steps=spec.horizon_steps,
         )
 
-    def _read(self, log: EpisodeLog) -> Played:
+    def _read(self, log: EpisodeLog) -> Demonstration:
         seen = [self.reader.read(result.observation)[VECTOR] for result in log.results[:-1]]
         actions: FloatArray = np.stack(log.asked).astype(np.float32)
         if self.env.spec.action.control_mode == DISCRETE:

@@ -1,4 +1,4 @@
-"""Learn from demonstrations that are played at the training's begin, not from rewards.
+"""Learn from demonstrations that the expert gives as the training begins, not from rewards.
 
 A class like the library's algorithms, so that everything around a training is the same: recipes, folders,
 checkpoints, resuming. A step is a gradient step. Demonstrations and the order in which they are read are
@@ -16,7 +16,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from vla_eval.agents.expert import Played, order
+from vla_eval.agents.expert import Demonstration, order
 from vla_eval.agents.vector_env import SlotsEnv
 from vla_eval.strict.bounds import require
 
@@ -34,14 +34,14 @@ class Demonstrations:
     n_steps: Tensor  # (N,) of each
 
     @classmethod
-    def of(cls, played: Sequence[Played]) -> Self:
+    def of(cls, episodes: Sequence[Demonstration]) -> Self:
         """Put episodes together."""
-        inputs = [torch.from_numpy(one) for one, _ in played]
+        inputs = [torch.from_numpy(one) for one, _ in episodes]
         n_steps = torch.tensor([len(one) for one in inputs])
         padded = pad_sequence(inputs, batch_first=True)
         return cls(
             inputs=padded,
-            actions=pad_sequence([torch.from_numpy(one) for _, one in played], batch_first=True),
+            actions=pad_sequence([torch.from_numpy(one) for _, one in episodes], batch_first=True),
             is_step=torch.arange(padded.shape[1]) < n_steps[:, None],
             n_steps=n_steps,
         )
@@ -52,10 +52,10 @@ class Imitation(BaseAlgorithm):
 
     Args:
         policy: the network's class, `policies.agents.imitator.CoreNetwork`.
-        env: the environments, where the expert plays.
+        env: the environments, where the expert acts.
         learning_rate: of Adam.
-        demonstrations: how many are played; of a robot's, those that succeed.
-        action_noise: what an arm is pushed by while the expert plays, as in recorded datasets; the expert's
+        demonstrations: how many there are; of a robot's, those that succeed.
+        action_noise: what an arm is pushed by while the expert acts, as in recorded datasets; the expert's
             own action is learned.
         batch_size: demonstrations per step.
         weight_decay: of AdamW.
@@ -113,7 +113,7 @@ class Imitation(BaseAlgorithm):
         goal = self.num_timesteps + total_timesteps
         callback.on_training_start(locals(), globals())
         if self._demonstrations is None:
-            for _ in self._played():
+            for _ in self._collect():
                 if not callback.on_step():
                     return self
         assert self._demonstrations is not None
@@ -130,22 +130,22 @@ class Imitation(BaseAlgorithm):
                 losses.clear()
         return self
 
-    def _played(self) -> Iterator[None]:
-        """Play all demonstrations, a batch at a time."""
-        found: list[Played] = []
+    def _collect(self) -> Iterator[None]:
+        """Let the expert act until all are there, a batch at a time."""
+        found: list[Demonstration] = []
         for batch in self._expert.demonstrations(self.n_demonstrations, noise=self.action_push):
             found += batch
             yield
         self._demonstrations = Demonstrations.of(found)
         self.policy.set_statistics(self._demonstrations.inputs[self._demonstrations.is_step])
 
-    def _step(self, played: Demonstrations) -> float:
+    def _step(self, given: Demonstrations) -> float:
         """Take one gradient step; return its loss, the mean over steps of the demonstrations read."""
         self._update_learning_rate(self.optimizer)
-        chosen = torch.from_numpy(self._chosen(len(played.n_steps)))
-        longest = int(played.n_steps[chosen].max())
+        chosen = torch.from_numpy(self._chosen(len(given.n_steps)))
+        longest = int(given.n_steps[chosen].max())
         inputs, actions, is_step = (
-            part[chosen, :longest].to(self.device) for part in (played.inputs, played.actions, played.is_step)
+            part[chosen, :longest].to(self.device) for part in (given.inputs, given.actions, given.is_step)
         )
         answers, _ = self.policy(inputs, self.policy.core.begin(len(chosen)))
         loss = self.policy.errors(answers, actions)[is_step].mean()

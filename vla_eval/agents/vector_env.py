@@ -37,7 +37,7 @@ def reward_of(result: StepResult, kind: Rewards) -> float:
 class SlotsEnv(VecEnv):
     """The slots of an environment; an episode that its rules do not end is *truncated* at the horizon.
 
-    `expert`: who plays in it for an algorithm that imitates; None for others.
+    `expert`: who acts in it for an algorithm that imitates; None for others.
     """
 
     def __init__(

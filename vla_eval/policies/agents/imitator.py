@@ -25,7 +25,7 @@ from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
 
 WHERE = "train_agent.network"
-# m, rad, or what inputs are in. What hardly varies where the expert plays would else be loud where an arm is
+# m, rad, or what inputs are in. What hardly varies where the expert acts would else be loud where an arm is
 # pushed aside.
 SMALLEST = 0.05
 LARGEST = 10.0  # standard deviations: what lies beyond is not like the demonstrations
