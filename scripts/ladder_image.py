@@ -1,0 +1,121 @@
+"""Draw `docs/images/ladder.png`, and print the tables of `docs/ladder.md`.
+
+python scripts/ladder_image.py docs/images/ladder.png \
+    runs/ladder_base/evaluation runs/ladder_robots/evaluation
+
+A score is the part of the way from the best player without memory (0) to the oracle (1), on the same seeds.
+"""
+
+import sys
+from collections import defaultdict
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+import numpy as np
+from matplotlib import pyplot as plt
+from scipy.stats import PermutationMethod, norm, spearmanr
+
+from vla_eval.records import EpisodeRecord
+from vla_eval.storage.run_folder import read_run
+from vla_eval.tasks.catalog import task_spec
+
+WITHOUT, WITH, WITHOUT_MEMORY = ("memoryless", "cue_blind"), "oracle", "mlp"
+CONTROLS = {*WITHOUT, WITH, "random"}
+ENDS = ("diagnostic", "robot")
+TYPES = ("object", "sequential", "capacity")
+MINUS = "\N{MINUS SIGN}"
+SIZE_IN, DPI = 3.1, 150
+Scores = dict[str, dict[str, float]]  # core -> task -> score
+
+
+def main() -> None:
+    """Read the two evaluations, print, draw."""
+    target, *folders = sys.argv[1:]
+    ends = dict(zip(ENDS, (scores_of(Path(folder)) for folder in folders), strict=True))
+    for scores in ends.values():
+        print(table(scores), "\n")
+    print("| memory | cores | diagnostic tasks | robot tasks | rank correlation | p |")
+    print("|---|--:|--:|--:|--:|--:|")
+    figure, panels = plt.subplots(1, 4, figsize=(4 * SIZE_IN, SIZE_IN), layout="constrained", sharey=True)
+    for axes, kind in zip(panels, ("all", *TYPES), strict=True):
+        cores = list(ends["diagnostic"])
+        for chosen in (cores, [core for core in cores if core != WITHOUT_MEMORY]):
+            print(correlation_row(kind, ends, chosen))
+        for number, core in enumerate(cores):
+            place = tuple(mean_of(ends[end][core], kind) for end in ENDS)
+            axes.plot(*place, "o", color=plt.get_cmap("tab10")(number))
+            axes.annotate(core, place, textcoords="offset points", xytext=(4, 3), fontsize=7)
+        axes.axhline(0, color="0.8", zorder=0)
+        axes.axvline(0, color="0.8", zorder=0)
+        axes.set(title=kind, xlabel="score on diagnostic tasks", xlim=(-0.35, 1.2))
+    panels[0].set(ylabel="score on robot tasks")
+    figure.savefig(target, dpi=DPI)
+
+
+def scores_of(folder: Path) -> Scores:
+    """Return the score of each core on each task, over all its run seeds."""
+    found: dict[tuple[str, str], list[float]] = defaultdict(list)
+    for record in read_run(folder).records:
+        found[record.policy, record.task].append(counted(record))
+    means = {key: float(np.mean(values)) for key, values in found.items()}
+    scores: Scores = defaultdict(dict)
+    for (policy, task), mean in means.items():
+        if policy not in CONTROLS:
+            low = next(means[control, task] for control in WITHOUT if (control, task) in means)
+            scores[policy][task] = (mean - low) / (means[WITH, task] - low)
+    return scores
+
+
+def counted(record: EpisodeRecord) -> float:
+    """Return the return of a diagnostic episode, or whether a robot's succeeded."""
+    found = record.episode_return if task_spec(record.task).is_base else record.success_once
+    if record.error is not None or found is None:
+        raise SystemExit(f"{record.policy} on {record.task}, seed {record.seed}: an error. Run it again.")
+    return float(found)
+
+
+def mean_of(scores: dict[str, float], kind: str) -> float:
+    """Return the mean score over the tasks of a type of memory, or over all."""
+    return float(np.mean([score for task, score in scores.items() if is_of(task, kind)]))
+
+
+def is_of(task: str, kind: str) -> bool:
+    """Whether a task is of a type; some are of several."""
+    return kind in ("all", *task_spec(task).memory_types)
+
+
+def correlation_row(kind: str, ends: dict[str, Scores], cores: list[str]) -> str:
+    """Return Spearman's correlation, its 95 % interval (Bonett and Wright 2000), and a permutation test."""
+    x, y = ([mean_of(ends[end][core], kind) for core in cores] for end in ENDS)
+    found = spearmanr(x, y, method=PermutationMethod(n_resamples=9999, rng=np.random.default_rng(0)))
+    rho = float(found.statistic)
+    error = norm.ppf(0.975) * np.sqrt((1 + rho**2 / 2) / (len(cores) - 3))
+    low, high = np.tanh(np.arctanh(np.clip(rho, -0.9999, 0.9999)) + np.array([-error, error]))
+    counts = [str(sum(is_of(task, kind) for task in ends[end][cores[0]])) for end in ENDS]
+    without = "" if WITHOUT_MEMORY in cores else f", without `{WITHOUT_MEMORY}`"
+    shown = f"{rho:.2f} [{low:.2f}, {high:.2f}]".replace("-", MINUS)
+    return " | ".join([f"| {kind}", f"{len(cores)}{without}", *counts, shown, f"{found.pvalue:.3f} |"])
+
+
+def table(scores: Scores) -> str:
+    """Return the scores as a table, a row per core, the best first."""
+    found = {task for row in scores.values() for task in row}
+    tasks = sorted(found, key=lambda task: (TYPES.index(task_spec(task).memory), task))
+    names = [task.removeprefix("mikasa_base/").removesuffix("-v0") for task in tasks]
+    kinds = [f"*{', '.join(task_spec(task).memory_types)}*" for task in tasks]
+    rows = [
+        f"| core | {' | '.join(names)} | mean |",
+        f"|---|{'--:|' * (len(tasks) + 1)}",
+        f"| *memory* | {' | '.join(kinds)} | |",
+    ]
+    for core in sorted(scores, key=lambda core: -mean_of(scores[core], "all")):
+        values = [*(scores[core][task] for task in tasks), mean_of(scores[core], "all")]
+        shown = " | ".join(f"{value:.2f}" for value in values).replace("-", MINUS)
+        rows.append(f"| `{core}` | {shown} |")
+    return "\n".join(rows)
+
+
+if __name__ == "__main__":
+    main()
