@@ -90,7 +90,7 @@ def test_padding_teaches_nothing() -> None:
 @pytest.mark.parametrize(
     ("task", "changes", "error", "message"),
     [
-        (BIT, {"arguments": {"action_noise": 0.1}}, RecipeError, "has no arm to push"),
+        (BIT, {"arguments": {"action_noise": 0.1}}, RecipeError, "have no arm to push"),
         (ROBOT, {"observation": "rgb_joints"}, RecipeError, "is given images"),
         (BIT, {"network": {"core": "grru"}}, VlaEvalError, "Did you mean 'gru'"),
         (
@@ -107,6 +107,7 @@ def test_padding_teaches_nothing() -> None:
         ),
         (BIT, {"network": {"net_arch": [8]}}, VlaEvalError, "net_arch"),
         (BIT, {"network": {"width": 0}}, VlaEvalError, "width"),
+        (ROBOT, {"reward": "sparse"}, RecipeError, "learns from no reward"),
         (BIT, {"arguments": {"demonstrations": True}}, RecipeError, "expected a whole number"),
         (BIT, {"arguments": {"batch_size": 0}}, RecipeError, "batch_size is 0, expected"),
         (BIT, {"arguments": {"demonstrations": 0}}, RecipeError, "demonstrations is 0, expected"),
@@ -117,6 +118,7 @@ def test_a_mistake_is_one_message(
 ) -> None:
     with pytest.raises(error, match=message):
         train_agent(tiny("imitation", tmp_path / "run", task, train_agent=changes))
+    assert not (tmp_path / "run" / "train").exists()
 
 
 def test_an_expert_that_fails_too_often_ends_the_training(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from vla_eval.config.agents import TRAINING_SEEDS
 from vla_eval.config.prompts import instruction_for
 from vla_eval.core import EpisodeStart, FloatArray, Policy, SimEnv, StepObserver, StepResult
 from vla_eval.data.recording.demonstrations import ONE_BY_ONE, EpisodeLog, NoisyEnv
-from vla_eval.errors import RecipeError, TrainingError
+from vla_eval.errors import TrainingError
 from vla_eval.policies.agents.observing import VECTOR, Reader
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
@@ -91,14 +91,8 @@ class Expert:
             noise: standard deviation of what an arm is pushed by, in units of a delta action.
 
         Raises:
-            RecipeError: there is noise, and no arm.
             TrainingError: the expert fails too often.
         """
-        if noise > 0 and self.is_base:
-            raise RecipeError(
-                f"train_agent.arguments.action_noise is {noise:g}: {self.env.spec.task} has no arm to push. "
-                "Leave it out."
-            )
         acting: SimEnv = NoisyEnv(self.env, noise) if noise > 0 else self.env
         n_kept, n_tried = 0, 0
         while n_kept < n:

@@ -21,9 +21,11 @@ from vla_eval.policies.agents.algorithms import (
     network_fields,
     steps_per_update,
 )
+from vla_eval.policies.agents.imitator import NETWORK, CoreSizes
 from vla_eval.policies.agents.observing import Reader, reader_of
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.specs import EnvSpec
+from vla_eval.strict.decoding import decode
 from vla_eval.tasks.arguments import pinned
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.objects.mesh_folder import without_path
@@ -86,6 +88,8 @@ def agent_job(config: AgentConfig) -> AgentJob:
             "Take ppo or ppo_lstm."
         )
     reader = reader_of(env, recipe.observation, n_candidates=task.n_candidates(settings.kwargs))
+    if row.imitates:
+        _check_imitation(recipe, reader, is_base=task.is_base)
     if task.is_base and recipe.reward == "sparse":
         raise RecipeError(f"--reward sparse: {task.id} has one reward, its own. Leave it out.")
     held_out = None if config.held_out is None else _checked_held_out(config.held_out, settings, recipe)
@@ -106,6 +110,25 @@ def agent_job(config: AgentConfig) -> AgentJob:
         held_out=held_out,
         workers=config.workers,
     )
+
+
+def _check_imitation(recipe: AgentRecipe, reader: Reader, *, is_base: bool) -> None:
+    """Refuse what no imitation can do."""
+    decode(CoreSizes, recipe.network, where=NETWORK)
+    noise = recipe.arguments.get("action_noise", 0)
+    if reader.cameras:
+        raise RecipeError(
+            "algorithm 'imitation' reads numbers, and is given images. Robot tasks have --observation "
+            "vector; networks that imitate from images are trained by `mikasa-vla finetune` "
+            "(docs/sequence_policies.md)."
+        )
+    if is_base and noise > 0:
+        raise RecipeError(
+            f"train_agent.arguments.action_noise is {noise:g}: tasks of MIKASA-Base have no arm to push. "
+            "Leave it out."
+        )
+    if recipe.reward != "dense":
+        raise RecipeError(f"--reward {recipe.reward}: an imitation learns from no reward. Leave it out.")
 
 
 def _without_arm(env: Mapping[str, Any]) -> dict[str, Any]:  # Any: arguments of a task

@@ -35,7 +35,7 @@ VERBS: Mapping[str, str] = {
     "replay": "check a dataset by running its episodes again",
     "dataset": "convert, mix, describe or share datasets",
     "finetune": "train a policy on a dataset, or resume the training",
-    "train-agent": "train an agent by rewards, or resume the training",
+    "train-agent": "train an agent by rewards or by imitation, or resume the training",
     "checkpoint": "check a checkpoint, or convert an original one",
     "serve": "serve a policy to simulators and other clients over WebSocket",
     "list": "list tasks, families, robots, policies, configs, prompts, datasets, protocols",

@@ -20,11 +20,11 @@ from vla_eval.models.sequence.core import CoreMemory
 from vla_eval.models.sequence.cores import make_core
 from vla_eval.models.sequence.heads import Gated
 from vla_eval.models.sequence.sizes import CORES, MANY, options_of
-from vla_eval.policies.agents.observing import IMAGE, VECTOR
+from vla_eval.policies.agents.observing import VECTOR
 from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
 
-WHERE = "train_agent.network"
+NETWORK = "train_agent.network"
 # m, rad, or what inputs are in. What hardly varies where the expert acts would else be loud where an arm is
 # pushed aside.
 SMALLEST = 0.05
@@ -50,14 +50,14 @@ class CoreSizes:
                 **dict.fromkeys(("width", "layers", "heads", "context_steps"), (1, MANY)),
                 "dropout": (0, 0.999),
             },
-            prefix=f"{WHERE}.",
+            prefix=f"{NETWORK}.",
         )
-        check_names("core", [self.core], CORES, where=f"{WHERE}.core")
+        check_names("core", [self.core], CORES, where=f"{NETWORK}.core")
         row = CORES[self.core]
         if row.heads_divide and self.width % self.heads:
-            raise RecipeError(f"{WHERE}.width is {self.width}, expected a multiple of heads={self.heads}.")
+            raise RecipeError(f"{NETWORK}.width is {self.width}, expected a multiple of heads={self.heads}.")
         if row.is_even and self.width % 2:
-            raise RecipeError(f"{WHERE}.width is {self.width}, expected an even number for '{self.core}'.")
+            raise RecipeError(f"{NETWORK}.width is {self.width}, expected an even number for '{self.core}'.")
         options_of(self.core, self.core_options)
 
 
@@ -71,7 +71,7 @@ class CoreNetwork(nn.Module):
         sizes: the fields of `CoreSizes`.
 
     Raises:
-        RecipeError: the sizes do not go together, or images are given.
+        RecipeError: the sizes do not go together.
     """
 
     mean: Tensor
@@ -82,13 +82,7 @@ class CoreNetwork(nn.Module):
     ) -> None:
         super().__init__()
         del lr_schedule
-        self.sizes = decode(CoreSizes, sizes, where=WHERE)
-        if IMAGE in observation.spaces:
-            raise RecipeError(
-                "algorithm 'imitation' reads numbers, and is given images. Take --observation vector; "
-                "networks that imitate from images are trained by `mikasa-vla finetune` "
-                "(docs/sequence_policies.md)."
-            )
+        self.sizes = decode(CoreSizes, sizes, where=NETWORK)
         self.action = action
         self.counts = _counts(action)  # of choices; none where the action is numbers
         n_inputs = int(np.prod(observation.spaces[VECTOR].shape or ()))
