@@ -1,5 +1,6 @@
 """The command line: fast, lazy, and every mistake one message on stderr with exit code 1."""
 
+import argparse
 import json
 import re
 import subprocess
@@ -219,3 +220,31 @@ def test_no_simulator_and_no_model_library_is_imported_for_a_look(
 
     assert code == 0
     assert not set(HEAVY) & set(modules)
+
+
+@pytest.mark.parametrize("is_linked", [True, False])
+def test_a_command_may_write_to_what_a_user_linked_into_runs(
+    is_linked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A table writes to `runs/NAME` without being asked; that folder may lie on another disk."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    (tmp_path / "work/runs").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "work")
+    if is_linked:
+        Path("runs/table").symlink_to(disk)
+
+    class Writes:
+        @staticmethod
+        def add_arguments(parser: argparse.ArgumentParser) -> None:
+            """Take none."""
+
+        @staticmethod
+        def run(args: argparse.Namespace) -> int:
+            (Path("runs/table" if is_linked else disk) / "inside").mkdir()
+            return 0
+
+    monkeypatch.setattr("vla_eval.cli.main._verb", lambda _name: Writes)
+    assert main(["doctor"]) == (0 if is_linked else 1)
+    assert [path.name for path in disk.iterdir()] == (["inside"] if is_linked else [])
+    assert ("refused to write" in capsys.readouterr().err) is not is_linked

@@ -15,6 +15,7 @@ from vla_eval.cli.shared.slips import about_choice, about_empty, about_flag
 from vla_eval.cli.terminal.streams import standard_streams
 from vla_eval.errors import MAX_SHOWN, VlaEvalError
 from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
+from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.workers.children import leave_working_directory
 
 PROGRAM = "mikasa-vla"
@@ -120,7 +121,7 @@ def _run(arguments: list[str]) -> int:
         if getattr(args, "no_lock", False):
             os.environ[OFF_VARIABLE] = "1"
         with locked():
-            let_write(Path("runs"), *_paths(args))
+            let_write(*_run_folders(), *_paths(args))
             code = _verb(args.verb).run(args)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of our output has gone (`| head`)
@@ -134,6 +135,13 @@ def _run(arguments: list[str]) -> int:
     except KeyboardInterrupt:
         return EXIT_INTERRUPTED
     return code
+
+
+def _run_folders() -> Iterator[Path]:
+    """Return where runs are written without --out, and what a user has linked into it from another disk."""
+    yield RUNS_FOLDER
+    if RUNS_FOLDER.is_dir():
+        yield from (path for path in RUNS_FOLDER.iterdir() if path.is_symlink())
 
 
 def build_parser(verbs: Iterable[str] = VERBS) -> argparse.ArgumentParser:
