@@ -1,10 +1,11 @@
 """Demonstrations of a training that imitates: the scripted expert acts in the training's environments."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any  # arrays of any dtype
+from typing import Any, NamedTuple  # Any: arrays of any dtype
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_eval.agents.job import AgentJob
 from vla_eval.base_tasks.named import DISCRETE
@@ -13,11 +14,13 @@ from vla_eval.config.prompts import instruction_for
 from vla_eval.core import EpisodeStart, FloatArray, Policy, SimEnv, StepObserver, StepResult
 from vla_eval.data.recording.demonstrations import ONE_BY_ONE, EpisodeLog, NoisyEnv
 from vla_eval.errors import TrainingError
-from vla_eval.policies.agents.observing import VECTOR, Reader
+from vla_eval.policies.agents.imitator import as_inputs
+from vla_eval.policies.agents.observing import Reader
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.seeding import Stream, generator
+from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 
 EXPERT = "oracle"
@@ -25,8 +28,13 @@ DEMONSTRATION, ORDER = 0, 1
 """What is drawn for an imitation, apart from all that belongs to a checkpoint."""
 ENOUGH_TRIES = 4  # so many times the demonstrations asked for; an expert that needs more is none
 
-Demonstration = tuple[FloatArray, FloatArray]
-"""What an agent would have been given in an episode, (T, inputs), and what the expert asked for, (T, A)."""
+
+class Demonstration(NamedTuple):
+    """One episode of the expert."""
+
+    inputs: FloatArray  # (T, inputs) what an agent would have been given
+    actions: FloatArray  # (T, A) what the expert asked for, in the agent's action space
+    meant: NDArray[np.int64]  # (T,) the candidate in view that it touched next; -1: none
 
 
 @dataclass(slots=True)
@@ -127,11 +135,31 @@ class Expert:
         )
 
     def _read(self, log: EpisodeLog) -> Demonstration:
-        seen = [self.reader.read(result.observation)[VECTOR] for result in log.results[:-1]]
+        seen = [as_inputs(self.reader.read(result.observation)) for result in log.results[:-1]]
         actions: FloatArray = np.stack(log.asked).astype(np.float32)
         if self.env.spec.action.control_mode == DISCRETE:
             actions = actions - np.array(self.env.spec.action.low, np.float32)  # choices count from 0
-        return np.stack(seen), actions
+        return Demonstration(np.stack(seen), actions, touched_next(log.results))
+
+
+def touched_next(results: Sequence[StepResult]) -> NDArray[np.int64]:
+    """Return (T,) of the T + 1 results of an episode: the candidate in view that is touched next.
+
+    Hindsight alone: what the demonstration shows later. -1 before the response, after the last touch, and for
+    tasks without candidates.
+    """
+    touched = [result.status.touched_candidates or () for result in results]
+    in_view = [
+        isinstance(world := result.observation.privileged, PrivilegedState) and world.phase == "response"
+        for result in results
+    ]
+    return np.array(
+        [
+            touched[-1][len(before)] if is_seen and len(before) < len(touched[-1]) else -1
+            for before, is_seen in zip(touched[:-1], in_view[:-1], strict=True)
+        ],
+        np.int64,
+    )
 
 
 def order(run_seed: int, pass_number: int, n: int) -> np.ndarray[Any, Any]:

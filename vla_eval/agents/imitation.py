@@ -31,18 +31,23 @@ class Demonstrations:
     inputs: Tensor  # (N, T, inputs) float32
     actions: Tensor  # (N, T, A) float32, in the agent's action space
     is_step: Tensor  # (N, T) bool; False: padding
+    meant: Tensor  # (N, T) int64
     n_steps: Tensor  # (N,) of each
 
     @classmethod
     def of(cls, episodes: Sequence[Demonstration]) -> Self:
         """Put episodes together."""
-        inputs = [torch.from_numpy(one) for one, _ in episodes]
-        n_steps = torch.tensor([len(one) for one in inputs])
-        padded = pad_sequence(inputs, batch_first=True)
+        n_steps = torch.tensor([len(one.inputs) for one in episodes])
+        padded = [
+            pad_sequence([torch.from_numpy(part) for part in parts], batch_first=True)
+            for parts in zip(*episodes, strict=True)
+        ]
+        inputs, actions, meant = padded
         return cls(
-            inputs=padded,
-            actions=pad_sequence([torch.from_numpy(one) for _, one in episodes], batch_first=True),
-            is_step=torch.arange(padded.shape[1]) < n_steps[:, None],
+            inputs=inputs,
+            actions=actions,
+            meant=meant,
+            is_step=torch.arange(inputs.shape[1]) < n_steps[:, None],
             n_steps=n_steps,
         )
 
@@ -57,6 +62,8 @@ class Imitation(BaseAlgorithm):
         demonstrations: how many there are; of a robot's, those that succeed.
         action_noise: what an arm is pushed by while the expert acts, as in recorded datasets; the expert's
             own action is learned.
+        meant_weight: of the cross-entropy of the candidate that the expert touched next, beside the squared
+            errors of its actions: what an arm does once it moves tells where it goes, and needs no memory.
         batch_size: demonstrations per step.
         weight_decay: of AdamW.
         max_grad_norm: longer gradients are cut to it.
@@ -71,6 +78,7 @@ class Imitation(BaseAlgorithm):
         learning_rate: float = 1e-3,
         demonstrations: int = 250,
         action_noise: float = 0.0,
+        meant_weight: float = 0.02,
         batch_size: int = 32,
         weight_decay: float = 0.0,
         max_grad_norm: float = 1.0,
@@ -82,13 +90,15 @@ class Imitation(BaseAlgorithm):
         )
         for name, count in (("demonstrations", demonstrations), ("batch_size", batch_size)):
             require(type(count) is int and count >= 1, f"{ARGUMENTS}.{name}", count, "a whole number ≥ 1")
-        for name, size in (("action_noise", action_noise), ("weight_decay", weight_decay)):
+        weights = {"action_noise": action_noise, "meant_weight": meant_weight, "weight_decay": weight_decay}
+        for name, size in weights.items():
             require(0 <= size < math.inf, f"{ARGUMENTS}.{name}", size, "a number ≥ 0")
         require(max_grad_norm > 0, f"{ARGUMENTS}.max_grad_norm", max_grad_norm, "a number above 0")
         assert env.expert is not None
         self._expert = env.expert
         self.batch_size, self.n_demonstrations = batch_size, demonstrations
         self.action_push, self._weight_decay, self._max_grad_norm = action_noise, weight_decay, max_grad_norm
+        self._meant_weight = meant_weight
         self._demonstrations: Demonstrations | None = None
         self._setup_model()
 
@@ -144,11 +154,13 @@ class Imitation(BaseAlgorithm):
         self._update_learning_rate(self.optimizer)
         chosen = torch.from_numpy(self._chosen(len(given.n_steps)))
         longest = int(given.n_steps[chosen].max())
-        inputs, actions, is_step = (
-            part[chosen, :longest].to(self.device) for part in (given.inputs, given.actions, given.is_step)
+        inputs, actions, meant, is_step = (
+            part[chosen, :longest].to(self.device)
+            for part in (given.inputs, given.actions, given.meant, given.is_step)
         )
         answers, _ = self.policy(inputs, self.policy.core.begin(len(chosen)))
-        loss = self.policy.errors(answers, actions)[is_step].mean()
+        errors = self.policy.errors(answers, actions, meant, meant_weight=self._meant_weight)
+        loss = errors[is_step].mean()
         self.optimizer.zero_grad()
         loss.backward()
         torch.nn.utils.clip_grad_norm_(self.policy.parameters(), self._max_grad_norm)

@@ -6,7 +6,7 @@ with images and tasks of a few numbers.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any  # spaces of Gymnasium, and values of a recipe
+from typing import Any, NamedTuple  # Any: spaces of Gymnasium, and values of a recipe
 
 import gymnasium as gym
 import numpy as np
@@ -20,7 +20,7 @@ from vla_eval.models.sequence.core import CoreMemory
 from vla_eval.models.sequence.cores import make_core
 from vla_eval.models.sequence.heads import Gated
 from vla_eval.models.sequence.sizes import CORES, MANY, options_of
-from vla_eval.policies.agents.observing import VECTOR
+from vla_eval.policies.agents.observing import PLACES, VECTOR, Seen
 from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
 
@@ -28,6 +28,7 @@ NETWORK = "train_agent.network"
 # m, rad, or what inputs are in. What hardly varies where the expert acts would else be loud where an arm is
 # pushed aside.
 SMALLEST = 0.05
+PLACE_M = 0.1  # the order of distances between candidates
 LARGEST = 10.0  # standard deviations: what lies beyond is not like the demonstrations
 
 
@@ -61,11 +62,25 @@ class CoreSizes:
         options_of(self.core, self.core_options)
 
 
+def as_inputs(seen: Seen) -> FloatArray:
+    """Return what an agent is given as one vector, or a row of each: the vector, then the places, if any."""
+    parts = [seen[VECTOR], *([seen[PLACES].reshape(*seen[PLACES].shape[:-2], -1)] if PLACES in seen else [])]
+    inputs: FloatArray = np.concatenate(parts, axis=-1).astype(np.float32)
+    return inputs
+
+
+class Answers(NamedTuple):
+    """What the network says at each step."""
+
+    action: Tensor  # (B, T, outputs)
+    meant: Tensor | None  # (B, T, n) logits of which of n places is meant; None: there are none
+
+
 class CoreNetwork(nn.Module):
     """Reads (B, T, inputs) and answers each step with what an action is chosen by.
 
     Args:
-        observation: what is given: one vector, by the name `vector`.
+        observation: what is given: `vector`, and `places`, one of which may be meant.
         action: a box (answers are the action), or choices (answers are their logits, one after the other).
         lr_schedule: the library gives it; not used.
         sizes: the fields of `CoreSizes`.
@@ -85,7 +100,10 @@ class CoreNetwork(nn.Module):
         self.sizes = decode(CoreSizes, sizes, where=NETWORK)
         self.action = action
         self.counts = _counts(action)  # of choices; none where the action is numbers
-        n_inputs = int(np.prod(observation.spaces[VECTOR].shape or ()))
+        self.n_places = (
+            int((observation.spaces[PLACES].shape or (0,))[0]) if PLACES in observation.spaces else 0
+        )
+        n_inputs = int(np.prod(observation.spaces[VECTOR].shape or ())) + 3 * self.n_places
         n_outputs = sum(self.counts) if self.counts else int(np.prod(action.shape or ()))
         width = self.sizes.width
         # What the inputs are on the demonstrations; saved with the weights.
@@ -104,10 +122,10 @@ class CoreNetwork(nn.Module):
             given=self.sizes.core_options,
         )
         # The step itself is read beside the core's answer, so that the core is free to hold what was before.
-        # Products, because what was remembered often says which of the numbers in view is meant.
-        self.answer = nn.Sequential(
-            Gated(2 * width, width), nn.LayerNorm(width), Gated(width, width), nn.Linear(width, n_outputs)
-        )
+        self.decide = nn.Sequential(Gated(2 * width, width), nn.LayerNorm(width))
+        if self.n_places:  # which of them is meant is decided; where it is, is in view
+            self.choose, self.towards = nn.Linear(width, self.n_places), nn.Linear(3, width)
+        self.answer = nn.Sequential(Gated(width, width), nn.Linear(width, n_outputs))
 
     def set_statistics(self, inputs: Tensor) -> None:
         """Normalise by mean and deviation of (N, inputs), but enlarge nothing by more than `SMALLEST`."""
@@ -115,21 +133,36 @@ class CoreNetwork(nn.Module):
         self.mean.copy_(mean)
         self.scale.copy_(deviation.clamp(min=SMALLEST))
 
-    def forward(self, inputs: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
-        """Return answers (B, T, outputs) to inputs (B, T, inputs), and the memory after the last."""
+    def forward(self, inputs: Tensor, memory: CoreMemory) -> tuple[Answers, CoreMemory]:
+        """Return the answers to inputs (B, T, inputs), and the memory after the last."""
         tokens = self.read(((inputs - self.mean) / self.scale).clamp(-LARGEST, LARGEST))
         remembered, memory = self.core(tokens, memory)
-        return self.answer(torch.cat([remembered, tokens], dim=-1)), memory
+        decided = self.decide(torch.cat([remembered, tokens], dim=-1))
+        meant = None
+        if self.n_places:
+            meant = self.choose(decided)
+            places = inputs[..., -3 * self.n_places :].reshape(*inputs.shape[:-1], self.n_places, 3)
+            place = meant.softmax(dim=-1)[..., None, :] @ (places / PLACE_M)
+            decided = decided + self.towards(place[..., 0, :])
+        return Answers(self.answer(decided), meant), memory
 
-    def errors(self, answers: Tensor, actions: Tensor) -> Tensor:
-        """Return (B, T): squared errors of actions (B, T, A), or the choices' cross-entropies, added up."""
-        if not self.counts:
-            return (answers - actions).square().mean(dim=-1)
-        parts = zip(self._of_choices(answers), actions.long().unbind(-1), strict=True)
-        found = [
-            functional.cross_entropy(part.transpose(1, 2), chosen, reduction="none") for part, chosen in parts
-        ]
-        return torch.stack(found).sum(dim=0)
+    def errors(self, answers: Answers, actions: Tensor, meant: Tensor, *, meant_weight: float) -> Tensor:
+        """Return the error of each step, (B, T).
+
+        Args:
+            answers: what the network said.
+            actions: (B, T, A). Numbers have the mean of squared errors, choices the sum of cross-entropies.
+            meant: (B, T) the candidate that the expert touched next; -1 where there is none.
+            meant_weight: of its cross-entropy.
+        """
+        if self.counts:
+            parts = zip(self._of_choices(answers.action), actions.long().unbind(-1), strict=True)
+            found = torch.stack([_cross_entropy(part, chosen) for part, chosen in parts]).sum(dim=0)
+        else:
+            found = (answers.action - actions).square().mean(dim=-1)
+        if answers.meant is None:
+            return found
+        return found + meant_weight * _cross_entropy(answers.meant, meant)
 
     def _of_choices(self, answers: Tensor) -> tuple[Tensor, ...]:
         """Return the logits of each choice."""
@@ -152,8 +185,8 @@ class CoreNetwork(nn.Module):
         assert deterministic and len(episode_start) == 1
         with torch.inference_mode():
             memory = self.core.begin(1) if state is None else tuple(torch.from_numpy(part) for part in state)
-            answers, memory = self(torch.from_numpy(np.asarray(seen[VECTOR], np.float32))[None], memory)
-        answer, kept = answers[:, 0], tuple(part.numpy() for part in memory)
+            answers, memory = self(torch.from_numpy(as_inputs(seen)[:, None]), memory)
+        answer, kept = answers.action[:, 0], tuple(part.numpy() for part in memory)
         if not self.counts:
             assert isinstance(self.action, gym.spaces.Box)
             return np.clip(answer.numpy(), self.action.low, self.action.high), kept
@@ -163,6 +196,11 @@ class CoreNetwork(nn.Module):
     def set_training_mode(self, mode: bool) -> None:
         """Train or answer: the library's word for it."""
         self.train(mode)
+
+
+def _cross_entropy(logits: Tensor, chosen: Tensor) -> Tensor:
+    """Return (B, T) of logits (B, T, n); 0 where -1 is chosen."""
+    return functional.cross_entropy(logits.transpose(1, 2), chosen, reduction="none", ignore_index=-1)
 
 
 def _counts(action: gym.Space[Any]) -> list[int]:

@@ -19,8 +19,8 @@ from vla_eval.specs import ActionSpec, EnvSpec
 from vla_eval.task_state import PHASES, PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 
-VECTOR, IMAGE = "vector", "image"
-"""Names of what an agent is given."""
+VECTOR, IMAGE, PLACES = "vector", "image", "places"
+"""Names of what an agent is given; `places` (n, 3): of candidates, in m from the tool centre point."""
 SMALLEST_IMAGE_PX = 36  # what the library's network of convolutions can read
 
 Seen = Mapping[str, np.ndarray[Any, Any]]
@@ -31,6 +31,7 @@ class _Mode:
     """How one mode reads an observation of a robot task."""
 
     read: Callable[[Observation], list[FloatArray]]
+    places: Callable[[Observation], FloatArray] | None = None
     privileged: bool = False
     cameras: bool = False
     needs_candidates: bool = False
@@ -73,22 +74,27 @@ def _state(seen: Observation) -> list[FloatArray]:
 
 
 def _vector(seen: Observation) -> list[FloatArray]:
-    """Arm, which cue is shown now, and, from the response phase on, where each candidate lies."""
+    """Arm, which cue is shown now, and whether candidates are in view."""
     world = _world(seen)
-    n, is_due = len(world.candidate_positions_m), world.phase == "response"
-    relative_m = world.candidate_positions_m - world.tcp_position_m
-    parts = [
-        *_proprioception(seen),
-        _one_hot(world.shown_candidates, n),
-        [float(is_due)],  # whether candidates are in view; their places are zeros before
-        (relative_m if is_due else np.zeros_like(relative_m)).ravel(),
-    ]
+    shown = _one_hot(world.shown_candidates, len(world.candidate_positions_m))
+    parts = [*_proprioception(seen), shown, [float(_is_due(world))]]
     return [np.asarray(part, np.float32) for part in parts]
+
+
+def _is_due(world: PrivilegedState) -> bool:
+    return world.phase == "response"
+
+
+def _places(seen: Observation) -> FloatArray:
+    """Where each candidate lies from the response phase on; zeros before."""
+    world = _world(seen)
+    relative_m = world.candidate_positions_m - world.tcp_position_m
+    return np.asarray(relative_m if _is_due(world) else np.zeros_like(relative_m), np.float32)
 
 
 MODES: Mapping[Observed, _Mode] = {
     "state": _Mode(read=_state, privileged=True),
-    "vector": _Mode(read=_vector, privileged=True, needs_candidates=True),
+    "vector": _Mode(read=_vector, places=_places, privileged=True, needs_candidates=True),
     "rgb_joints": _Mode(read=_proprioception, cameras=True),
 }
 
@@ -126,6 +132,8 @@ def reader_of(env: EnvSpec, mode: Observed | None, *, n_candidates: int) -> Read
         if row.privileged and seen.privileged is None:
             raise SpecMismatchError(f"{env.task}: the agent is given '{chosen}', and this has no true state.")
         found = {VECTOR: np.concatenate(row.read(seen))}
+        if row.places is not None:
+            found[PLACES] = row.places(seen)
         if cameras:
             found[IMAGE] = np.concatenate([seen.images[name].transpose(2, 0, 1) for name in cameras])
         return found
