@@ -10,18 +10,20 @@ import torch
 pytest.importorskip("stable_baselines3", reason="needs `make rl`")
 
 from tests.agents.tiny_agents import BIT, ROBOT, tiny, trained
-from vla_eval.agents.expert import Expert
+from vla_eval.agents.expert import Demonstration, Expert, touched_next
 from vla_eval.agents.imitation import Demonstrations
 from vla_eval.agents.job import agent_job
 from vla_eval.agents.train import environments, train_agent
 from vla_eval.cli.main import main
 from vla_eval.config.agents import AgentTable, is_agent_table
 from vla_eval.config.files import load_recipe
+from vla_eval.core import Observation, StepResult
 from vla_eval.errors import RecipeError, TrainingError, VlaEvalError
 from vla_eval.models.sequence.sizes import CORES
 from vla_eval.policies.agents.imitator import CoreNetwork
-from vla_eval.policies.agents.observing import VECTOR, action_space, given_space
+from vla_eval.policies.agents.observing import PLACES, VECTOR, action_space, given_space
 from vla_eval.storage.run_folder import read_run
+from vla_eval.task_state import TaskStatus
 
 pytestmark = pytest.mark.usefixtures("in_this_process", "light_workers")
 SIZES = {"width": 16, "layers": 2, "heads": 2, "context_steps": 4}
@@ -35,25 +37,30 @@ def expert(out: Path, task: str, **changes: Any) -> Expert:
     return found
 
 
-def network(core: str, task: str, out: Path, n_inputs: int = 5) -> CoreNetwork:
+def network(core: str, task: str, out: Path) -> CoreNetwork:
+    """Return a network that is given five numbers, and on a robot the places of four candidates."""
     torch.manual_seed(0)
     action = action_space(agent_job(tiny("imitation", out, task)).env.action)
     sizes = {**SIZES, "core": core, "core_options": FEW.get(core, {})}
-    return CoreNetwork(given_space({VECTOR: (n_inputs,)}), action, None, **sizes).eval()
+    shapes: dict[str, tuple[int, ...]] = {VECTOR: (5,), **({PLACES: (4, 3)} if task == ROBOT else {})}
+    return CoreNetwork(given_space(shapes), action, None, **sizes).eval()
 
 
 @pytest.mark.parametrize("task", [pytest.param(ROBOT, marks=pytest.mark.slow), BIT])
 @pytest.mark.parametrize("core", CORES)
 def test_step_by_step_a_core_answers_what_it_was_taught_at_once(core: str, task: str, tmp_path: Path) -> None:
     made = network(core, task, tmp_path)
-    inputs = torch.randn(1, 11, 5, generator=torch.Generator().manual_seed(1))
+    generator = torch.Generator().manual_seed(1)
+    inputs = torch.randn(1, 11, 5 + 3 * made.n_places, generator=generator)
     made.set_statistics(inputs[0])
     with torch.inference_mode():
-        at_once, _ = made(inputs, made.core.begin(1))
-    expected = at_once[0].split(made.counts, dim=-1) if made.counts else at_once[0].clamp(-1, 1)
+        at_once = made(inputs, made.core.begin(1))[0].action[0]
+    expected = at_once.split(made.counts, dim=-1) if made.counts else at_once.clamp(-1, 1)
     state = None
     for step in range(11):
-        seen = {VECTOR: inputs[:, step].numpy()}
+        seen = {VECTOR: inputs[:, step, :5].numpy()}
+        if made.n_places:
+            seen[PLACES] = inputs[:, step, 5:].reshape(1, -1, 3).numpy()
         action, state = made.predict(
             seen, state=state, episode_start=np.array([step == 0]), deterministic=True
         )
@@ -64,27 +71,53 @@ def test_step_by_step_a_core_answers_what_it_was_taught_at_once(core: str, task:
 def test_what_is_learned_is_what_the_agent_would_see_and_the_expert_asked_for(tmp_path: Path) -> None:
     """Of MemoryLength: the bit is shown first, and named at the end; the horizon is 11."""
     (batch,) = expert(tmp_path / "run", BIT).demonstrations(2, noise=0.0)
-    assert [inputs.shape[0] for inputs, _ in batch] == [actions.shape[0] for _, actions in batch] == [11, 11]
-    assert all(actions[-1, 0] in (0, 1) for _, actions in batch)
+    assert [len(one.inputs) for one in batch] == [len(one.actions) for one in batch] == [11, 11]
+    assert all(one.actions[-1, 0] in (0, 1) and set(one.meant) == {-1} for one in batch)
     (again,) = expert(tmp_path / "again", BIT).demonstrations(2, noise=0.0)
     for one, other in zip(batch, again, strict=True):
-        np.testing.assert_array_equal(one[0], other[0])
-        np.testing.assert_array_equal(one[1], other[1])
+        np.testing.assert_array_equal(one.inputs, other.inputs)
+        np.testing.assert_array_equal(one.actions, other.actions)
     (other_seed,) = expert(tmp_path / "other", BIT, run_seed=1).demonstrations(2, noise=0.0)
-    assert any((one[0] != other[0]).any() for one, other in zip(batch, other_seed, strict=True))
+    assert any((one.inputs != other.inputs).any() for one, other in zip(batch, other_seed, strict=True))
 
 
 def test_padding_teaches_nothing() -> None:
-    short, long = (
-        (np.ones((2, 3), np.float32), np.ones((2, 1), np.float32)),
-        (
-            np.full((5, 3), 2, np.float32),
-            np.zeros((5, 1), np.float32),
-        ),
-    )
-    found = Demonstrations.of([short, long])
+    def ones(n_steps: int, value: float) -> Demonstration:
+        return Demonstration(
+            np.full((n_steps, 3), value, np.float32),
+            np.full((n_steps, 1), value, np.float32),
+            np.full(n_steps, 1, np.int64),
+        )
+
+    found = Demonstrations.of([ones(2, 1.0), ones(5, 2.0)])
     assert found.is_step.sum(dim=1).tolist() == found.n_steps.tolist() == [2, 5]
     assert found.inputs[0, :2].min() == 1 and found.inputs[1].min() == 2
+    assert found.actions.shape == (2, 5, 1) and found.meant.shape == (2, 5)
+
+
+def test_what_is_meant_is_what_is_touched_next_while_candidates_are_in_view() -> None:
+    """Touches at steps 3 and 5; candidates are in view from step 1 on; nothing is touched after step 5."""
+    touched: list[tuple[int, ...]] = [(), (), (), (2,), (2,), (2, 0), (2, 0)]
+    observation = Observation(step=0, images={}, state={})
+    results = [
+        StepResult(
+            observation=observation,
+            status=TaskStatus(phase="response" if step else "cue", success=False, touched_candidates=now),
+        )
+        for step, now in enumerate(touched)
+    ]
+    assert touched_next(results).tolist() == [-1, 2, 2, 0, 0, -1]
+
+
+def test_a_step_without_a_candidate_that_is_meant_costs_nothing(tmp_path: Path) -> None:
+    made = network("gru", ROBOT, tmp_path)
+    inputs = torch.zeros(1, 2, 5 + 3 * made.n_places)
+    answers, _ = made(inputs, made.core.begin(1))
+    actions, meant = answers.action.detach() + 0.5, torch.tensor([[-1, 1]])
+    found = made.errors(answers, actions, meant, meant_weight=2.0)
+    assert answers.meant is not None
+    expected = -float(answers.meant[0, 1].detach().log_softmax(dim=-1)[1])
+    assert found[0].tolist() == pytest.approx([0.25, 0.25 + 2 * expected])
 
 
 @pytest.mark.parametrize(

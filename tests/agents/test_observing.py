@@ -16,7 +16,8 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.core import Observation, StepResult
 from vla_eval.envs.factory import describe_env, make_env
 from vla_eval.errors import RecipeError, UnknownNameError
-from vla_eval.policies.agents.observing import VECTOR, Reader, action_space, as_action, reader_of
+from vla_eval.policies.agents.imitator import as_inputs
+from vla_eval.policies.agents.observing import PLACES, VECTOR, Reader, action_space, as_action, reader_of
 from vla_eval.task_state import PrivilegedState, TaskStatus
 from vla_eval.tasks.catalog import TASKS, task_spec
 
@@ -55,7 +56,7 @@ def test_after_the_cue_a_vector_does_not_depend_on_which_candidate_is_right(
         seen(np.random.default_rng(4), phase=phase, right=right, shown=()) for right in ((1,), other)
     )
     vector, state = robot_reader("vector").read, robot_reader("state").read
-    np.testing.assert_array_equal(vector(one)[VECTOR], vector(changed)[VECTOR])
+    np.testing.assert_array_equal(as_inputs(vector(one)), as_inputs(vector(changed)))
     assert not np.array_equal(state(one)[VECTOR], state(changed)[VECTOR])
 
 
@@ -64,7 +65,10 @@ def test_before_the_response_a_vector_does_not_depend_on_where_candidates_will_b
     assert isinstance(first.privileged, PrivilegedState)
     moved = replace(first, privileged=replace(first.privileged, candidate_positions_m=np.ones((N, 3))))
     read = robot_reader("vector").read
-    np.testing.assert_array_equal(read(first)[VECTOR], read(moved)[VECTOR])
+    np.testing.assert_array_equal(as_inputs(read(first)), as_inputs(read(moved)))
+    due = [replace(one, privileged=replace(one.privileged, phase="response")) for one in (first, moved)]
+    assert not np.array_equal(read(due[0])[PLACES], read(due[1])[PLACES])
+    assert read(due[0])[PLACES].shape == (N, 3)
 
 
 def test_a_vector_shows_the_cue_while_it_is_shown() -> None:

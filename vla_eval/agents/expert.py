@@ -20,7 +20,6 @@ from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.seeding import Stream, generator
-from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
 
 EXPERT = "oracle"
@@ -149,10 +148,7 @@ def touched_next(results: Sequence[StepResult]) -> NDArray[np.int64]:
     tasks without candidates.
     """
     touched = [result.status.touched_candidates or () for result in results]
-    in_view = [
-        isinstance(world := result.observation.privileged, PrivilegedState) and world.phase == "response"
-        for result in results
-    ]
+    in_view = [result.status.phase == "response" for result in results]
     return np.array(
         [
             touched[-1][len(before)] if is_seen and len(before) < len(touched[-1]) else -1
