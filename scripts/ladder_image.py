@@ -1,7 +1,6 @@
-"""Draw `docs/images/ladder.png`, and print the tables of `docs/ladder.md`.
+"""Draw whether a memory core's rank on diagnostic tasks is that on robot tasks, and print tables of both.
 
-python scripts/ladder_image.py docs/images/ladder.png \
-    runs/ladder_base/evaluation runs/ladder_robots/evaluation
+python scripts/ladder_image.py ladder.png runs/ladder_base/evaluation runs/ladder_robots/evaluation
 
 A score is the part of the way from the best player without memory (0) to the oracle (1), on the same seeds.
 """
@@ -25,6 +24,7 @@ WITHOUT, WITH, WITHOUT_MEMORY = ("memoryless", "cue_blind"), "oracle", "mlp"
 CONTROLS = {*WITHOUT, WITH, "random"}
 ENDS = ("diagnostic", "robot")
 TYPES = ("object", "sequential", "capacity")
+IN_ORDER = "sequential"  # the robot tasks of this type ask for an order
 MINUS = "\N{MINUS SIGN}"
 SIZE_IN, DPI = 3.1, 150
 Scores = dict[str, dict[str, float]]  # core -> task -> score
@@ -69,11 +69,20 @@ def scores_of(folder: Path) -> Scores:
 
 
 def counted(record: EpisodeRecord) -> float:
-    """Return the return of a diagnostic episode, or whether a robot's succeeded."""
-    found = record.episode_return if task_spec(record.task).is_base else record.success_once
-    if record.error is not None or found is None:
+    """Return the return of a diagnostic episode, or which part of a robot's choices was right."""
+    if record.error is not None:
         raise SystemExit(f"{record.policy} on {record.task}, seed {record.seed}: an error. Run it again.")
-    return float(found)
+    return record.episode_return if task_spec(record.task).is_base else part_right(record)
+
+
+def part_right(record: EpisodeRecord) -> float:
+    """Return which part of the right candidates is among as many first touches; of a chain, at its place."""
+    right, touched = record.right_candidates, record.touched_candidates
+    if not right or touched is None:
+        raise SystemExit(f"{record.task}, seed {record.seed}: its record does not say what was right.")
+    if task_spec(record.task).memory == IN_ORDER:
+        return sum(one == other for one, other in zip(right, touched, strict=False)) / len(right)
+    return len(set(right) & set(touched[: len(right)])) / len(right)
 
 
 def mean_of(scores: dict[str, float], kind: str) -> float:
