@@ -70,7 +70,7 @@ def scores_of(folder: Path) -> Scores:
 
 def counted(record: EpisodeRecord) -> float:
     """Return the return of a diagnostic episode, or which part of a robot's choices was right."""
-    if record.error is not None:
+    if record.error is not None or record.episode_return is None:
         raise SystemExit(f"{record.policy} on {record.task}, seed {record.seed}: an error. Run it again.")
     return record.episode_return if task_spec(record.task).is_base else part_right(record)
 
