@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from safetensors import SafetensorError
 
-from vla_eval.errors import CheckpointError, StorageFullError
+from vla_eval.errors import CheckpointError, LockedError, StorageFullError
 from vla_eval.storage.drafts import whole_folder
 from vla_eval.storage.durable import on_disk, storage_full
 
@@ -64,3 +64,9 @@ def test_other_errors_stay_what_they_are(other: Exception, tmp_path: Path) -> No
 def test_what_may_not_be_written_is_not_a_full_disk(tmp_path: Path) -> None:
     said = str(storage_full(tmp_path, OSError(errno.EACCES, "Permission denied")))
     assert "Make it writable and run the same command again" in said and "space" not in said
+
+
+def test_what_the_lock_refuses_is_no_full_disk(tmp_path: Path) -> None:
+    said = str(storage_full(tmp_path, LockedError("refused to write. Run it with --no-lock.")))
+    assert "Name its folder in the command" in said and "--no-lock" in said
+    assert "Free some space" not in said

@@ -13,7 +13,7 @@ import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vla_eval.errors import FolderInUseError, RunFolderError, StorageFullError
+from vla_eval.errors import FolderInUseError, LockedError, RunFolderError, StorageFullError
 from vla_eval.strict.json_text import Source, read_file
 
 logger = logging.getLogger(__name__)
@@ -188,6 +188,8 @@ def on_disk(path: Path) -> Iterator[None]:
 
 def storage_full(path: Path, cause: OSError) -> StorageFullError:
     """Build the error for a file that could not be written, or only in part."""
+    if isinstance(cause, LockedError):
+        return StorageFullError(f"{path}: could not be written. Name its folder in the command, or: {cause}")
     is_closed = cause.errno in (errno.EACCES, errno.EPERM, errno.EROFS)
     return StorageFullError(
         f"{path}: could not be written ({cause.strerror or cause}). Nothing that was reported as finished is "
