@@ -19,7 +19,7 @@ from vla_eval.errors import RecipeError, check_names
 from vla_eval.models.sequence.core import CoreMemory
 from vla_eval.models.sequence.cores import make_core
 from vla_eval.models.sequence.heads import Gated
-from vla_eval.models.sequence.sizes import CORES, MANY, options_of
+from vla_eval.models.sequence.sizes import CORES, MANY, RecurrentOptions, options_of
 from vla_eval.policies.agents.observing import PLACES, VECTOR, Seen
 from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
@@ -29,6 +29,8 @@ NETWORK = "train_agent.network"
 # pushed aside.
 SMALLEST = 0.05
 PLACE_M = 0.1  # the order of distances between candidates
+# Of gates that keep the state, at first: at 0 half of a memory is gone after a step (docs/agents.md).
+KEEP_BIAS = 3.0
 LARGEST = 10.0  # standard deviations: what lies beyond is not like the demonstrations
 
 
@@ -59,7 +61,13 @@ class CoreSizes:
             raise RecipeError(f"{NETWORK}.width is {self.width}, expected a multiple of heads={self.heads}.")
         if row.is_even and self.width % 2:
             raise RecipeError(f"{NETWORK}.width is {self.width}, expected an even number for '{self.core}'.")
-        options_of(self.core, self.core_options)
+        options_of(self.core, self.options)
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Options of the core: what is given, over `keep_bias` of a GRU or an LSTM."""
+        recurrent = isinstance(CORES[self.core].options, RecurrentOptions)
+        return {**({"keep_bias": KEEP_BIAS} if recurrent else {}), **self.core_options}
 
 
 def as_inputs(seen: Seen) -> FloatArray:
@@ -119,7 +127,7 @@ class CoreNetwork(nn.Module):
             heads=self.sizes.heads,
             context_steps=self.sizes.context_steps,
             dropout=self.sizes.dropout,
-            given=self.sizes.core_options,
+            given=self.sizes.options,
         )
         # The step itself is read beside the core's answer, so that the core is free to hold what was before.
         self.decide = nn.Sequential(Gated(2 * width, width), nn.LayerNorm(width))
