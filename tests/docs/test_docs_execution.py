@@ -51,13 +51,15 @@ NOT_EXECUTED: Mapping[str, str] = {
         "joints, which the fake simulator has not; tests/data/test_record_maniskill.py"
     ),
     r"eval .*--delay-trace .*": "a run whose delays were measured; tests/evaluation/test_delays.py",
-    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/(memory|base_table)/.*": (
+    r"train-agent .*|eval .* runs/(bit|rc3|lstm) .*|eval runs/(memory|base_table)/.*": (
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
     r"audit --stored-frames.*": "twenty episodes at least; tests/audit/test_stored_frames.py",
     r"real (record )?--robot bench_3.yaml .*": "an arm; tests/envs/test_robot_env.py, tests/real",
     r"dataset (check|adopt) data/so101": "a download; tests/data/test_arm_datasets.py",
-    r"real record .*|(real|finetune) .*act_shuffled.*": "minutes; tests/real/test_recorded_to_real.py",
+    r"real record .*|(real|finetune) .*act_shuffled.*|real .*recurrent=runs/rec .*": (
+        "a policy trained for the arm: minutes; tests/real/test_recorded_to_real.py"
+    ),
     r"real .*--rehearse .*": "faults, which end with 3; tests/real/test_real_command.py",
     r"report .* --card .*": "a card of a checkpoint; tests/results/test_model_card.py",
     r"reproduce .*": "up to hundreds of episodes; tests/cli/test_reproduce.py",
