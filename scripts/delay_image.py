@@ -11,6 +11,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 from matplotlib import pyplot as plt
+from matplotlib.ticker import MaxNLocator
 
 from vla_eval.results.own_statistics import SUCCESS
 from vla_eval.results.report import Row, build_table
@@ -52,6 +53,7 @@ def main() -> None:
                     capsize=3,
                 )
         axes.set(title=f"K = {size}", xlabel="delay (control steps)", ylim=(-0.05, 1.05))
+        axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     panels[0, 0].set(ylabel="success once")
     marks = [plt.Line2D([], [], color=COLORS[i], label=name) for i, name in enumerate(policies)]
     shown = [one for one in EXECUTIONS if any(execution == one for _, _, execution in cells)]

@@ -47,11 +47,11 @@ NOT_EXECUTED: Mapping[str, str] = {
     r"merge .*-of-8.*": "eight shards; those of two are put together here",
     r"probe .* --probe appearance .*": "what the fake simulator does not draw; tests/probe/test_probe.py",
     r"probe probe|probe probe --set .*": "all changes of all tasks; tests/probe",
-    r"record .*--set env.control_mode=.*|record offline_rl .*": (
-        "joints, which the fake simulator has not; tests/data/test_record_maniskill.py"
+    r"record .*--set env.control_mode=.*|record offline_rl .*|record --task real_twin/.*": (
+        "joints and arms, which the fake simulator has not; tests/data/test_record_maniskill.py"
     ),
     r"eval .*--delay-trace .*": "a run whose delays were measured; tests/evaluation/test_delays.py",
-    r"train-agent .*|eval .* runs/(bit|rc3|lstm) .*|eval runs/(memory|base_table)/.*": (
+    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/(memory|base_table)/.*": (
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
     r"audit --stored-frames.*": "twenty episodes at least; tests/audit/test_stored_frames.py",
@@ -93,7 +93,7 @@ def why_not(command: str) -> str | None:
 
 def small(command: str) -> tuple[str, ...]:
     """Return the words of a command, small: on one task, without a viewer."""
-    text = re.sub(r"(?<=^record )(.*)--task( [\w-]+-v0)+", r"\1", command).replace(" --web", "")
+    text = re.sub(r"(?<=^record )(.*)--task( [\w/-]+-v0)+", r"\1", command).replace(" --web", "")
     words = tuple(shlex.split(text))
     more = ("--episodes", "20") if words[0] == "record" and "--shard" in words else ()
     return (*words, *SMALL.get(words[0], ()), *more)
