@@ -19,7 +19,7 @@ from vla_eval.config.agents import AgentTable, is_agent_table
 from vla_eval.config.files import load_recipe
 from vla_eval.core import Observation, StepResult
 from vla_eval.errors import RecipeError, TrainingError, VlaEvalError
-from vla_eval.models.sequence.sizes import CORES
+from vla_eval.models.cores.sizes import CORES
 from vla_eval.policies.agents.imitator import CoreNetwork
 from vla_eval.policies.agents.observing import PLACES, VECTOR, action_space, given_space
 from vla_eval.storage.run_folder import read_run

@@ -13,9 +13,9 @@ from tests.models.sequence.test_sequence_parts import SMALL_OPTIONS
 from vla_eval.chunking import ChunkingSpec
 from vla_eval.core import ObservationWindow
 from vla_eval.errors import SpecMismatchError
+from vla_eval.models.cores.sizes import CORES
 from vla_eval.models.memory.configuration_memory import MikasaMemoryConfig
 from vla_eval.models.sequence.configuration_sequence import MikasaSequenceConfig
-from vla_eval.models.sequence.sizes import CORES
 from vla_eval.models.shared.earlier_frames import FrameMemory
 from vla_eval.models.shared.frame_choice import RULES, FrameChoice
 from vla_eval.policies.context import PolicyContext

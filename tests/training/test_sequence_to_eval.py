@@ -20,7 +20,7 @@ from vla_eval.config.finetuning import FinetuneConfig
 from vla_eval.core import EpisodeStart
 from vla_eval.envs.factory import make_env
 from vla_eval.errors import RecipeError
-from vla_eval.models.sequence.sizes import CORES, ElmurOptions, TransformerXLOptions
+from vla_eval.models.cores.sizes import CORES, ElmurOptions, TransformerXLOptions
 from vla_eval.policies.lerobot.policy import make_lerobot
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.training.finetune import finetune

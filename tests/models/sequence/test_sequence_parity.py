@@ -19,8 +19,8 @@ from torch import Tensor
 
 from tests.models.golden_values import GoldenValues
 from tests.models.sequence.original_weights import ours
-from vla_eval.models.sequence.core import Core
-from vla_eval.models.sequence.cores import make_core
+from vla_eval.models.cores.core import Core
+from vla_eval.models.cores.cores import make_core
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "sequence" / "io.safetensors"
 STEPS = 3

@@ -7,8 +7,9 @@ import torch
 from torch import Tensor
 
 from vla_eval.errors import VlaEvalError
-from vla_eval.models.sequence.core import Core
-from vla_eval.models.sequence.cores import make_core
+from vla_eval.models.cores.core import Core
+from vla_eval.models.cores.cores import make_core
+from vla_eval.models.cores.sizes import CORES
 from vla_eval.models.sequence.encoders import (
     FRAMES_AT_ONCE,
     LEAST_VARIANCE,
@@ -18,7 +19,7 @@ from vla_eval.models.sequence.encoders import (
     ShapesAndColors,
     spatial_softmax,
 )
-from vla_eval.models.sequence.sizes import CORES, ENCODERS
+from vla_eval.models.sequence.sizes import ENCODERS
 
 WIDTH, N_STEPS = 8, 12
 SMALL_OPTIONS: dict[str, dict[str, Any]] = {

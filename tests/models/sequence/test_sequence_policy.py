@@ -15,9 +15,9 @@ from vla_eval.config.finetuning import FinetuneRecipe
 from vla_eval.config.policy import PolicyRecipe
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import RecipeError
+from vla_eval.models.cores.sizes import CORES
 from vla_eval.models.episodes.samples import Episodes, episodes_of
 from vla_eval.models.sequence.modeling_sequence import Demonstrated, MikasaSequencePolicy
-from vla_eval.models.sequence.sizes import CORES
 from vla_eval.training.dataset import training_dataset
 
 TINY = {"width": 16, "heads": 2, "context_steps": 2, "chunk_size": 3, "n_action_steps": 2}

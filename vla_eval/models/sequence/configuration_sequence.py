@@ -11,17 +11,9 @@ from numpy.typing import NDArray
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind
+from vla_eval.models.cores.sizes import BELOW_ONE, CORES, TransformerXLOptions, options_of
 from vla_eval.models.episodes.config import EpisodeConfig
-from vla_eval.models.sequence.sizes import (
-    BELOW_ONE,
-    CORES,
-    ENCODERS,
-    HEADS,
-    TOKENS,
-    TransformerXLOptions,
-    encoder_stages,
-    options_of,
-)
+from vla_eval.models.sequence.sizes import ENCODERS, HEADS, TOKENS, encoder_stages
 from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, LANGUAGE, Stage, Stages, image_shape
 from vla_eval.strict.bounds import check_bounds, require
 

@@ -5,23 +5,10 @@ from collections.abc import Callable
 import torch
 from lerobot.policies.common.flow_matching import euler_integrate, sample_time_beta
 from torch import Tensor, nn
-from torch.nn import functional
 
+from vla_eval.models.cores.gated import Gated
 from vla_eval.models.sequence.sizes import FLOW_TIME, N_FLOW_LAYERS
 from vla_eval.models.shared.prefix import Prefix
-
-
-class Gated(nn.Module):
-    """A layer whose outputs are products: a linear map, gated by another one (Shazeer 2020, SwiGLU)."""
-
-    def __init__(self, inputs: int, outputs: int) -> None:
-        super().__init__()
-        self.values, self.gates = nn.Linear(inputs, outputs), nn.Linear(inputs, outputs)
-
-    def forward(self, inputs: Tensor) -> Tensor:
-        """Return (…, outputs) of (…, inputs)."""
-        gated: Tensor = functional.silu(self.gates(inputs)) * self.values(inputs)
-        return gated
 
 
 class PrefixReader(nn.Module):

@@ -10,6 +10,10 @@ from lerobot.policies.rtc.modeling_rtc import RTCProcessor
 from torch import Tensor, nn
 
 from vla_eval.features import REWARD_KEY, STATE_KEY, RewardKind
+from vla_eval.models.cores.core import CoreMemory
+from vla_eval.models.cores.cores import make_core
+from vla_eval.models.cores.gated import Gated
+from vla_eval.models.cores.sizes import CORES
 from vla_eval.models.episodes.config import POSITION_SCALE, SPACE
 from vla_eval.models.episodes.policy import EpisodePolicy
 from vla_eval.models.episodes.samples import (
@@ -21,11 +25,8 @@ from vla_eval.models.episodes.samples import (
 )
 from vla_eval.models.episodes.sentence import SentenceEncoder, said_at_each_step, with_sentence
 from vla_eval.models.sequence.configuration_sequence import TYPE, MikasaSequenceConfig
-from vla_eval.models.sequence.core import CoreMemory
-from vla_eval.models.sequence.cores import make_core
 from vla_eval.models.sequence.encoders import Cameras
-from vla_eval.models.sequence.heads import FlowHead, Gated, PrefixReader
-from vla_eval.models.sequence.sizes import CORES
+from vla_eval.models.sequence.heads import FlowHead, PrefixReader
 from vla_eval.models.shared.precision import in_float32
 from vla_eval.models.shared.prefix import Prefix, drawn_lengths, prefix_of
 

@@ -16,10 +16,10 @@ from torch.nn import functional
 
 from vla_eval.core import FloatArray
 from vla_eval.errors import RecipeError, check_names
-from vla_eval.models.sequence.core import CoreMemory
-from vla_eval.models.sequence.cores import make_core
-from vla_eval.models.sequence.heads import Gated
-from vla_eval.models.sequence.sizes import CORES, MANY, RecurrentOptions, options_of
+from vla_eval.models.cores.core import CoreMemory
+from vla_eval.models.cores.cores import make_core
+from vla_eval.models.cores.gated import Gated
+from vla_eval.models.cores.sizes import CORES, MANY, RecurrentOptions, options_of
 from vla_eval.policies.agents.observing import PLACES, VECTOR, Seen
 from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
@@ -36,7 +36,7 @@ LARGEST = 10.0  # standard deviations: what lies beyond is not like the demonstr
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoreSizes:
-    """The fields `train_agent.network` of an imitator; what they mean: `models.sequence.core`."""
+    """The fields `train_agent.network` of an imitator; what they mean: `models.cores.core`."""
 
     core: str = "gru"
     width: int = 64

@@ -18,15 +18,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.sequence.core import CoreMemory, Segmented
-from vla_eval.models.sequence.relative_attention import (
+from vla_eval.models.cores.core import CoreMemory, Segmented
+from vla_eval.models.cores.relative_attention import (
     RelativeAttention,
     RelativeBiases,
     causal,
     distances_of,
     sinusoids,
 )
-from vla_eval.models.sequence.sizes import TransformerXLOptions
+from vla_eval.models.cores.sizes import TransformerXLOptions
 
 
 class GruGate(nn.Module):

@@ -10,8 +10,8 @@ from typing import Any  # mambapy is untyped
 import torch
 from torch import Tensor, nn
 
-from vla_eval.models.sequence.core import Core, CoreMemory
-from vla_eval.models.sequence.sizes import MambaOptions
+from vla_eval.models.cores.core import Core, CoreMemory
+from vla_eval.models.cores.sizes import MambaOptions
 
 
 class MambaLayer(nn.Module):

@@ -7,17 +7,17 @@ from typing import Any  # values of a recipe
 import torch
 from torch import Tensor, nn
 
-from vla_eval.models.sequence.core import Core, CoreMemory
-from vla_eval.models.sequence.elmur import Elmur
-from vla_eval.models.sequence.mamba import DecisionMamba
-from vla_eval.models.sequence.sizes import (
+from vla_eval.models.cores.core import Core, CoreMemory
+from vla_eval.models.cores.elmur import Elmur
+from vla_eval.models.cores.mamba import DecisionMamba
+from vla_eval.models.cores.sizes import (
     ElmurOptions,
     MambaOptions,
     RecurrentOptions,
     TransformerXLOptions,
     options_of,
 )
-from vla_eval.models.sequence.transformer_xl import TransformerXL
+from vla_eval.models.cores.transformer_xl import TransformerXL
 
 
 class PerStep(Core):

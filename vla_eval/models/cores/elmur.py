@@ -15,15 +15,15 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from vla_eval.models.sequence.core import CoreMemory, Segmented
-from vla_eval.models.sequence.relative_attention import (
+from vla_eval.models.cores.core import CoreMemory, Segmented
+from vla_eval.models.cores.relative_attention import (
     RelativeAttention,
     RelativeBiases,
     causal,
     distances_of,
     sinusoids,
 )
-from vla_eval.models.sequence.sizes import ElmurOptions
+from vla_eval.models.cores.sizes import ElmurOptions
 
 NORM_EPS = 1e-8  # of the source's norms
 EMPTY = -1  # when a slot was written that never was
