@@ -16,7 +16,7 @@ from vla_eval.errors import RecipeError
 from vla_eval.evaluation.resolve import FINGERPRINT_DIGITS, ResolvedEvaluation
 from vla_eval.policies.entries import PolicyEntry, load_policy_entry
 from vla_eval.policies.given import given_entry
-from vla_eval.storage.run_file import RUNS_FOLDER
+from vla_eval.storage.starting import RUNS_FOLDER
 from vla_eval.strict.calls import public
 from vla_eval.workers.in_process import IN_PROCESS
 from vla_eval.workers.local import LOCAL

@@ -140,8 +140,8 @@ def run(args: argparse.Namespace) -> int:
     from vla_eval.evaluation.needed_files import needed_files
     from vla_eval.evaluation.resolve import ResolvedEvaluation
     from vla_eval.policies.entries import load_policy_entries, refuse_unfetched
-    from vla_eval.storage.run_file import RUNS_FOLDER
     from vla_eval.storage.run_folder import read_run
+    from vla_eval.storage.starting import RUNS_FOLDER
 
     if args.config is not None:
         from vla_eval.evaluation.model_table import is_model_table

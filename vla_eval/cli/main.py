@@ -15,7 +15,7 @@ from vla_eval.cli.shared.slips import about_choice, about_empty, about_flag
 from vla_eval.cli.terminal.streams import standard_streams
 from vla_eval.errors import MAX_SHOWN, VlaEvalError
 from vla_eval.lock.switch import OFF_VARIABLE, let_write, locked
-from vla_eval.storage.run_file import RUNS_FOLDER
+from vla_eval.storage.starting import RUNS_FOLDER
 from vla_eval.workers.children import leave_working_directory
 
 PROGRAM = "mikasa-vla"
@@ -140,8 +140,9 @@ def _run(arguments: list[str]) -> int:
 def _run_folders() -> Iterator[Path]:
     """Return where runs are written without --out, and what a user has linked into it from another disk."""
     yield RUNS_FOLDER
-    if RUNS_FOLDER.is_dir():
-        yield from (path for path in RUNS_FOLDER.iterdir() if path.is_symlink())
+    if RUNS_FOLDER.is_dir() and os.access(RUNS_FOLDER, os.R_OK):
+        with os.scandir(RUNS_FOLDER) as entries:  # which asks the disk once, however many runs there are
+            yield from (Path(entry.path) for entry in entries if entry.is_symlink())
 
 
 def build_parser(verbs: Iterable[str] = VERBS) -> argparse.ArgumentParser:

@@ -15,8 +15,8 @@ from vla_eval.errors import RecipeError, some_of
 from vla_eval.evaluation.delay_trace import RunDelays
 from vla_eval.policies.entries import PolicyEntry, load_policy_entries
 from vla_eval.policies.recipe import bare_policy
-from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.storage.shard import Shard, shard_folder
+from vla_eval.storage.starting import RUNS_FOLDER
 from vla_eval.tasks.arguments import pinned
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.objects.mesh_folder import without_path

@@ -20,8 +20,8 @@ from vla_eval.real.plan import FIRST_DEMONSTRATION_BLOCK, PlannedEpisode, make_p
 from vla_eval.records import EpisodeKey
 from vla_eval.rollout import RolloutSettings
 from vla_eval.storage.provenance import collect_environment
-from vla_eval.storage.run_file import RUNS_FOLDER
 from vla_eval.storage.run_folder import RunDescription
+from vla_eval.storage.starting import RUNS_FOLDER
 from vla_eval.strict.bounds import MAX_EPISODES, check_seeds, require
 from vla_eval.tasks.real_stages import COLORS, Stage, stage_of
 

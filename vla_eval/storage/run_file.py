@@ -18,7 +18,6 @@ FORMAT_VERSION = 1
 """Of the whole run folder. Raise it when a file changes its meaning; others are refused."""
 
 RUN_FILE = "run.json"
-RUNS_FOLDER = Path("runs")  # run folders without a name of their own are made in it
 NOT_SET = "(not set)"
 MAX_LISTED, MAX_LINE = 20, 400  # changes in one message, and characters of each
 SPARSE_FIELDS = ("shard", "training_seeds", "memories")  # of a description; written where they say something

@@ -14,6 +14,7 @@ from vla_eval.storage.durable import DISK_TROUBLE, FolderLock, storage_full
 logger = logging.getLogger(__name__)
 
 LOGS_FOLDER = "logs"
+RUNS_FOLDER = Path("runs")  # run folders without a name of their own are made in it
 
 
 class StartedFolder:

@@ -17,7 +17,7 @@ from vla_eval.evaluation.model_table import (
     load_model_table,
     narrow,
 )
-from vla_eval.storage.run_file import RUNS_FOLDER
+from vla_eval.storage.starting import RUNS_FOLDER
 from vla_eval.strict.bounds import MAX_SECONDS
 from vla_eval.training.finetune_jobs import RUNNER, Finetuned, FinetuneJob
 from vla_eval.workers.backend import Backend, Pool
