@@ -81,6 +81,7 @@ def part_right(record: EpisodeRecord) -> float:
     if not right or touched is None:
         raise SystemExit(f"{record.task}, seed {record.seed}: its record does not say what was right.")
     if task_spec(record.task).memory == IN_ORDER:
+        # Fewer may be touched than are right: what is missing at the end is not right.
         return sum(one == other for one, other in zip(right, touched, strict=False)) / len(right)
     return len(set(right) & set(touched[: len(right)])) / len(right)
 

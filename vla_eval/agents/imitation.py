@@ -58,7 +58,7 @@ class Imitation(BaseAlgorithm):
     Args:
         policy: the network's class, `policies.agents.imitator.CoreNetwork`.
         env: the environments, where the expert acts.
-        learning_rate: of Adam.
+        learning_rate: of AdamW.
         demonstrations: how many there are; of a robot's, those that succeed.
         action_noise: what an arm is pushed by while the expert acts, as in recorded datasets; the expert's
             own action is learned.

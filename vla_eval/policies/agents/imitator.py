@@ -136,7 +136,7 @@ class CoreNetwork(nn.Module):
         self.answer = nn.Sequential(Gated(width, width), nn.Linear(width, n_outputs))
 
     def set_statistics(self, inputs: Tensor) -> None:
-        """Normalise by mean and deviation of (N, inputs), but enlarge nothing by more than `SMALLEST`."""
+        """Normalise by mean and deviation of (N, inputs), with deviations of `SMALLEST` at least."""
         deviation, mean = torch.std_mean(inputs.double(), dim=0, correction=0)
         self.mean.copy_(mean)
         self.scale.copy_(deviation.clamp(min=SMALLEST))
