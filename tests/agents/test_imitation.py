@@ -130,13 +130,25 @@ def test_a_step_without_a_candidate_that_is_meant_costs_nothing(tmp_path: Path) 
             BIT,
             {"network": {"core": "transformer", "width": 10, "heads": 4}},
             RecipeError,
-            "a multiple of heads=4",
+            r"train_agent.network.width is 10, expected a multiple of 2 · heads \(8\)",
+        ),
+        (
+            BIT,
+            {
+                "network": {
+                    "core": "rate",
+                    "width": 10,
+                    "core_options": {"memory_tokens": 2, "valve_heads": 4},
+                }
+            },
+            RecipeError,
+            r"expected a multiple of valve_heads \(4\)",
         ),
         (
             BIT,
             {"network": {"core": "gru", "core_options": {"keep_bas": 1}}},
             VlaEvalError,
-            "Did you mean 'keep_bias'",
+            "train_agent.network.core_options .*Did you mean 'keep_bias'",
         ),
         (BIT, {"network": {"net_arch": [8]}}, VlaEvalError, "net_arch"),
         (BIT, {"network": {"width": 0}}, VlaEvalError, "width"),
@@ -184,6 +196,7 @@ def test_a_gru_learns_a_bit_and_an_mlp_does_not(tmp_path: Path) -> None:
 def test_the_two_tables_of_the_ladder_have_the_same_cores() -> None:
     tables = [load_recipe("configs", f"ladder_{end}", AgentTable).value for end in ("base", "robots")]
     assert tables[0].variants == tables[1].variants
+    assert tables[0].train_agent == tables[1].train_agent
     assert {one["network"]["core"] for one in tables[0].variants.values()} == set(CORES)
     assert all(is_agent_table(f"ladder_{end}") for end in ("base", "robots"))
 

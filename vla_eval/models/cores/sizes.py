@@ -129,9 +129,35 @@ CORES = {
 }
 
 
-def options_of(core: str, given: Mapping[str, Any]) -> CoreOptions:
+def check_core(
+    core: str, *, width: int, heads: int, given: Mapping[str, Any], prefix: str = ""
+) -> CoreOptions:
+    """Return the options of a core, of which a recipe gives `given`.
+
+    Args:
+        core: a name of `CORES`.
+        width: units of a token.
+        heads: of its attention, where it has any.
+        given: options that differ from the row's.
+        prefix: of the recipe's fields, in messages.
+
+    Raises:
+        RecipeError: there is no such option or value, or the width goes with neither the core nor its heads.
+    """
+    row, options = CORES[core], options_of(core, given, where=f"{prefix}core_options")
+    multiple = (heads if row.heads_divide else 1) * (2 if row.is_even else 1)
+    if width % multiple:
+        parts = f"2 · heads ({multiple})" if row.heads_divide else str(multiple)
+        raise RecipeError(f"{prefix}width is {width}, expected a multiple of {parts} for the core '{core}'")
+    valve = options.valve_heads if isinstance(options, TransformerXLOptions) else 0
+    if valve and width % valve:
+        raise RecipeError(f"{prefix}width is {width}, expected a multiple of valve_heads ({valve})")
+    return options
+
+
+def options_of(core: str, given: Mapping[str, Any], *, where: str = "core_options") -> CoreOptions:
     """Return the options of a core, with the values that a recipe gives."""
-    row, where = CORES[core], f"policy.core_options (core '{core}')"
+    row, where = CORES[core], f"{where} (core '{core}')"
     known = [field.name for field in fields(row.options) if field.name not in row.fixed]
     check_names("option", given, known, where=where)
     return decode(type(row.options), {**asdict(row.options), **given}, where=where)

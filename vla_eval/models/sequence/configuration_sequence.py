@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from vla_eval.errors import RecipeError
 from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind
-from vla_eval.models.cores.sizes import BELOW_ONE, CORES, TransformerXLOptions, options_of
+from vla_eval.models.cores.sizes import BELOW_ONE, CORES, check_core
 from vla_eval.models.episodes.config import EpisodeConfig
 from vla_eval.models.sequence.sizes import ENCODERS, HEADS, TOKENS, encoder_stages
 from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, LANGUAGE, Stage, Stages, image_shape
@@ -61,7 +61,7 @@ class MikasaSequenceConfig(EpisodeConfig):
         self.check_choice("tokens", TOKENS)
         counts = ("width", "layers", "heads", "context_steps", "num_inference_steps")
         check_bounds(self, {**dict.fromkeys(counts, (1, math.inf)), "dropout": (0, BELOW_ONE)})
-        self._check_width()
+        check_core(self.core, width=self.width, heads=self.heads, given=self.core_options)
         self._check_head()
         kinds = get_args(RewardKind)
         if self.reads_returns and self.reward not in kinds:
@@ -136,18 +136,6 @@ class MikasaSequenceConfig(EpisodeConfig):
             self.head,
             f"another with tokens={self.tokens}",
         )
-
-    def _check_width(self) -> None:
-        row, options = CORES[self.core], options_of(self.core, self.core_options)
-        multiple = (self.heads if row.heads_divide else 1) * (2 if row.is_even else 1)
-        if self.width % multiple:
-            parts = f"2 · heads ({multiple})" if row.heads_divide else str(multiple)
-            raise RecipeError(
-                f"width is {self.width}, expected a multiple of {parts} for the core '{self.core}'"
-            )
-        valve = options.valve_heads if isinstance(options, TransformerXLOptions) else 0
-        if valve and self.width % valve:
-            raise RecipeError(f"width is {self.width}, expected a multiple of valve_heads ({valve})")
 
 
 def network_stages(config: Any) -> Stages:

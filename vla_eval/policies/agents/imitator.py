@@ -15,11 +15,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.core import FloatArray
-from vla_eval.errors import RecipeError, check_names
+from vla_eval.errors import check_names
 from vla_eval.models.cores.core import CoreMemory
 from vla_eval.models.cores.cores import make_core
 from vla_eval.models.cores.gated import Gated
-from vla_eval.models.cores.sizes import CORES, MANY, RecurrentOptions, options_of
+from vla_eval.models.cores.sizes import CORES, MANY, RecurrentOptions, check_core
 from vla_eval.policies.agents.observing import PLACES, VECTOR, Seen
 from vla_eval.strict.bounds import check_bounds
 from vla_eval.strict.decoding import decode
@@ -56,12 +56,7 @@ class CoreSizes:
             prefix=f"{NETWORK}.",
         )
         check_names("core", [self.core], CORES, where=f"{NETWORK}.core")
-        row = CORES[self.core]
-        if row.heads_divide and self.width % self.heads:
-            raise RecipeError(f"{NETWORK}.width is {self.width}, expected a multiple of heads={self.heads}.")
-        if row.is_even and self.width % 2:
-            raise RecipeError(f"{NETWORK}.width is {self.width}, expected an even number for '{self.core}'.")
-        options_of(self.core, self.options)
+        check_core(self.core, width=self.width, heads=self.heads, given=self.options, prefix=f"{NETWORK}.")
 
     @property
     def options(self) -> dict[str, Any]:
