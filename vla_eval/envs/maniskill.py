@@ -21,8 +21,8 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
+from vla_eval.envs.camera_view import CameraView, DenseBodies
 from vla_eval.envs.scenes import CPU_RENDERER, build, describe, render_backend, take_human_image, take_images
-from vla_eval.envs.wrist_view import WristView
 from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.find import ROBOT, ROBOT_UIDS, action_of, control_mode_of
@@ -69,7 +69,11 @@ class ManiSkillEnv:
         self.device = describe(self._envs[0], settings)
         # On a GPU, an image takes a hundredth of the time.
         on_cpu = not batched and render_backend(settings) == CPU_RENDERER
-        self._wrist_views = [WristView() if on_cpu else None for _ in self._envs]
+        known: DenseBodies = {}
+        self._views = [
+            {name: CameraView(name, known) for name in settings.cameras} if on_cpu else None
+            for _ in self._envs
+        ]
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
         """Begin an episode in each of the given slots; see `SimEnv.reset`."""
@@ -121,7 +125,7 @@ class ManiSkillEnv:
         """Release the simulator."""
         for env in self._envs:
             env.close()
-        self._envs, self._wrist_views = [], []
+        self._envs, self._views = [], []
 
     def _by_env(self, slots: Mapping[int, object]) -> list[tuple[int, list[int]]]:
         """Return (environment index, its requested slots), in order."""
@@ -161,7 +165,7 @@ class ManiSkillEnv:
 
     def _images(self, index: int, steps: list[int]) -> dict[str, ImageArray]:
         env = self._envs[index]
-        images = take_images(env, self._settings.cameras, self._wrist_views[index])
+        images = take_images(env, self._settings.cameras, self._views[index])
         if any(self._settings.shows_human_camera(step, self.spec.horizon_steps) for step in steps):
             images[HUMAN_CAMERA] = take_human_image(env)
         return images

@@ -1,6 +1,7 @@
 """What adapters of ManiSkill environments share: images, the renderer's name. Knows no tasks."""
 
 import re
+from collections.abc import Mapping
 from typing import Any  # ManiSkill is untyped: its environments and tensors are Any here
 
 import sapien
@@ -8,8 +9,8 @@ import torch
 
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ImageArray
+from vla_eval.envs.camera_view import CameraView
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
-from vla_eval.envs.wrist_view import WRIST_CAMERA, WristView
 from vla_eval.errors import MissingDependencyError, RenderingError
 from vla_eval.strict.devices import refuse_missing_gpu
 
@@ -84,11 +85,11 @@ def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
 
 
 def take_images(
-    env: Any, cameras: tuple[str, ...], wrist_view: WristView | None = None
+    env: Any, cameras: tuple[str, ...], views: Mapping[str, CameraView] | None = None
 ) -> dict[str, ImageArray]:
     """Return camera name -> (B, H, W, 3) uint8 of a ManiSkill environment.
 
-    `wrist_view` draws the wrist camera's image where it can; None: all are drawn with the whole scene.
+    `views` draw the same images faster on a CPU; None: the scene itself is drawn.
     """
     if not cameras:
         raise RenderingError(
@@ -96,13 +97,16 @@ def take_images(
             "Name the cameras in EnvSettings.cameras."
         )
     check_no_environment_map(env.scene)
-    apart = {WRIST_CAMERA} if wrist_view and WRIST_CAMERA in cameras and wrist_view.submit(env) else set()
-    sensors = {name: env.scene.sensors[name] for name in cameras if name not in apart}
-    if sensors:
-        env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
-    for sensor in sensors.values():  # all are submitted before the first image is waited for
+    # All are submitted before the first image is waited for.
+    if views is not None:
+        for name in cameras:
+            views[name].submit(env)
+        return {name: views[name].image()[None] for name in cameras}
+    env.scene.update_render(update_sensors=True, update_human_render_cameras=False)
+    sensors = {name: env.scene.sensors[name] for name in cameras}
+    for sensor in sensors.values():
         sensor.capture()
-    images = {name: wrist_view.image()[None] for name in apart if wrist_view}
+    images = {}
     for name, sensor in sensors.items():
         textures = sensor.get_obs(rgb=True, depth=False, position=False, segmentation=False)
         images[name] = textures["rgb"].cpu().numpy()
