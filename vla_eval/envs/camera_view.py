@@ -6,19 +6,16 @@ made anew of them. Where the same ones are left as in the image before, as of li
 is made: SAPIEN would record its commands again, which takes as long as 15,000 triangles.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Any  # SAPIEN and ManiSkill are untyped: their scenes, entities and components are Any here
 
 import numpy as np
 import sapien
 from mani_skill.render import set_shader_pack
-from numpy.typing import NDArray
 
 from vla_eval.core import ImageArray
-from vla_eval.envs.pixel_cover import Chosen, Floats, Lens, Matrix, Mesh, covering
+from vla_eval.envs.dense_bodies import DenseBodies, DenseBody, is_dense, rendered
+from vla_eval.envs.pixel_cover import Chosen, Lens, Matrix, covering
 
-DENSE = 5_000  # triangles of a body whose triangles are looked at one by one
 GROUND = "ground"
 # Of a pose in the camera's frame (m, and entries of a rotation), at a focal length of 64 px: one as near as
 # this to that of an earlier image moves a corner by less than half of `pixel_cover.MARGIN_PX`.
@@ -27,86 +24,13 @@ STILL_FOCAL_PX = 64
 BOX_MARGIN_M = 0.002
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Part:
-    """What a shape with one material is made of."""
-
-    vertices: Floats  # (V, 3)
-    normals: Floats  # (V, 3)
-    uvs: Floats  # (V, 2)
-    triangles: NDArray[np.uint32]  # (T, 3)
-    material: Any
-    scale: Floats
-    local_pose: Any
-
-    def only(self, chosen: Chosen) -> Any:
-        """Return a shape of the triangles (T,) that are chosen, in their order."""
-        used = self.triangles[chosen].reshape(-1)
-        triangles = np.arange(len(used), dtype=np.uint32).reshape(-1, 3)
-        shape = sapien.render.RenderShapeTriangleMesh(
-            self.vertices[used], triangles, self.normals[used], self.uvs[used], self.material
-        )
-        shape.scale, shape.local_pose = self.scale, self.local_pose
-        return shape
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DenseBody:
-    """A body whose triangles are looked at one by one: the same in every episode."""
-
-    mesh: Mesh  # of all parts, in the body's frame
-    parts: tuple[Part, ...]
-    box: Matrix  # (8, 4) its corners, homogeneous
-    shading_mode: int
-
-    @classmethod
-    def of(cls, body: Any) -> "DenseBody":
-        """Read the meshes of what is rendered of a body."""
-        parts, vertices, triangles, n_vertices = [], [], [], 0
-        for shape, part in _parts(body):
-            read = Part(
-                vertices=np.array(part.vertices),
-                normals=np.array(part.get_vertex_normal()),
-                uvs=np.array(part.get_vertex_uv()),
-                triangles=np.array(part.triangles),
-                material=part.material,
-                scale=np.array(shape.scale),
-                local_pose=shape.local_pose,
-            )
-            frame = read.local_pose.to_transformation_matrix()
-            vertices.append(read.vertices * read.scale @ frame[:3, :3].T + frame[:3, 3])
-            triangles.append(read.triangles + n_vertices)
-            n_vertices += len(read.vertices)
-            parts.append(read)
-        mesh = Mesh.of(np.vstack(vertices), np.vstack(triangles))
-        lowest, highest = mesh.points.min(axis=1), mesh.points.max(axis=1)
-        chosen = np.indices((2, 2, 2)).reshape(3, 8).T
-        box = np.hstack((np.where(chosen, highest, lowest), np.ones((8, 1))))
-        return cls(mesh=mesh, parts=tuple(parts), box=box, shading_mode=body.shading_mode)
-
-    def only(self, chosen: Chosen) -> Any:
-        """Return what is to be rendered of the triangles (T,) that are chosen."""
-        body, first = sapien.render.RenderBodyComponent(), 0
-        for part in self.parts:
-            of_part = chosen[first : first + len(part.triangles)]
-            first += len(part.triangles)
-            if of_part.any():
-                body.attach(part.only(of_part))
-        body.shading_mode = self.shading_mode
-        return body
-
-
-DenseBodies = dict[str, DenseBody]
-"""By name; filled when a body is first drawn, and shared by all views of a simulator."""
-
-
 class _Shown:
     """A body of the original scene, and its copy: of a dense body, of the triangles that were found last."""
 
     def __init__(self, entity: Any, dense: DenseBody | None) -> None:
         self.entity, self.dense = entity, dense
         self.copy: Any = None  # nothing of it is to be drawn
-        self._body = _body(entity)
+        self._body = rendered(entity)
         if dense is None:
             self._copy_of(self._body.clone())
             return
@@ -118,7 +42,7 @@ class _Shown:
         if self.copy is None:
             return
         self.copy.pose = self.entity.pose
-        shown = _body(self.copy)
+        shown = rendered(self.copy)
         if shown.visibility != self._body.visibility:
             shown.visibility = self._body.visibility
 
@@ -155,9 +79,10 @@ class CameraView:
 
     def submit(self, env: Any) -> None:
         """Begin to draw the present image."""
-        if self._of is not env.scene:
+        is_new = self._of is not env.scene
+        if is_new:
             self._follow(env)
-        if self._choose():
+        if self._choose() or is_new:
             self._arrange()
         for one in self._shown:
             one.follow()
@@ -185,11 +110,10 @@ class CameraView:
         self._camera = _camera_like(self._scene, sensor.config, original)
         dense = self._dense(env, is_fixed=sensor.entity is None)
         self._shown = [
-            _Shown(one, dense.get(one.per_scene_id)) for one in whole.entities if _body(one) is not None
+            _Shown(one, dense.get(one.per_scene_id)) for one in whole.entities if rendered(one) is not None
         ]
         self._culled = [one for one in self._shown if one.dense is not None]
         self._added: list[Any] = []
-        self._arrange()
         self._of = env.scene
 
     def _choose(self) -> bool:
@@ -225,38 +149,11 @@ class CameraView:
             bodies[GROUND] = env.scene.actors[GROUND]._objs[0]
         found = {}
         for name, entity in bodies.items():
-            if name not in self._known and _is_dense(entity):
-                self._known[name] = DenseBody.of(_body(entity))
-            if name in self._known:
-                found[entity.per_scene_id] = self._known[name]
+            if name not in self._known:
+                self._known[name] = DenseBody.of(rendered(entity)) if is_dense(entity) else None
+            if (dense := self._known[name]) is not None:
+                found[entity.per_scene_id] = dense
         return found
-
-
-def _body(entity: Any) -> Any:
-    """Return what is rendered of an entity, or None."""
-    return entity.find_component_by_type(sapien.render.RenderBodyComponent)
-
-
-def _parts(body: Any) -> Iterator[tuple[Any, Any]]:
-    """Yield the parts of a body's meshes, each with its shape."""
-    for shape in body.render_shapes:
-        for part in shape.parts:
-            yield shape, part
-
-
-def _is_dense(entity: Any) -> bool:
-    """Return whether a body is of many triangles, and can be made anew from arrays with the same pixels."""
-    body = _body(entity)
-    if body is None:
-        return False
-    kind = sapien.render.RenderShapeTriangleMesh
-    if not all(isinstance(one, kind) and one.front_face == "counterclockwise" for one in body.render_shapes):
-        return False
-    parts = [part for _, part in _parts(body)]
-    # A map of normals needs tangents, which files have, and arrays have not.
-    if any(part.material.normal_texture is not None for part in parts):
-        return False
-    return sum(len(part.triangles) for part in parts) >= DENSE
 
 
 def _is_outside(boxes: Matrix, views: Matrix, lens: Lens) -> Chosen:

@@ -21,7 +21,8 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
-from vla_eval.envs.camera_view import CameraView, DenseBodies
+from vla_eval.envs.camera_view import CameraView
+from vla_eval.envs.dense_bodies import DenseBodies
 from vla_eval.envs.scenes import CPU_RENDERER, build, describe, render_backend, take_human_image, take_images
 from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX

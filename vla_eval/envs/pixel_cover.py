@@ -2,8 +2,8 @@
 
 A rasteriser colours a pixel where a triangle covers its centre. Of a mesh that is much finer than the image,
 nearly all triangles lie between centres: one whose corners are all between the same two columns of centres,
-or the same two rows, covers none, whatever else is drawn. Nor is one drawn that shows its back. What is left
-out here is certain; of what is kept, some colours nothing, either.
+or the same two rows, covers none, whatever else is drawn. What is left out is certain; of what is kept, some
+colours nothing, either. Backs of triangles are kept: SAPIEN draws them, and at edges they are seen.
 """
 
 from dataclasses import dataclass
@@ -57,8 +57,6 @@ class Mesh:
 def covering(mesh: Mesh, view: Matrix, lens: Lens) -> Chosen:
     """Return (T,) bool: False for triangles that colour no pixel, for certain.
 
-    A triangle shows its front where its corners are seen counterclockwise.
-
     Args:
         mesh: the triangles.
         view: (4, 4) from the body's frame to the camera's: x ahead, y to the left, z up; m.
@@ -85,23 +83,7 @@ def covering(mesh: Mesh, view: Matrix, lens: Lens) -> Chosen:
     spans_row = (spans & ROW) | (unsure & ROW_UNSURE) != 0
     is_behind = first & second & third & BEHIND != 0
     chosen: Chosen = spans_column & spans_row & ~is_behind
-    # Of these alone, which are few.
-    few = np.flatnonzero(chosen)
-    corners = [corner[few] for corner in mesh.corners]
-    is_back = _is_back([u_px[corner] for corner in corners], [v_px[corner] for corner in corners])
-    is_ahead = ~np.logical_or.reduce([is_near[corner] for corner in corners])
-    chosen[few[is_back & is_ahead]] = False
     return chosen
-
-
-def _is_back(u_px: list[Floats], v_px: list[Floats]) -> Chosen:
-    """Return whether three corners are seen clockwise, however far the margin moves them."""
-    ahead_u, ahead_v = u_px[1] - u_px[0], v_px[1] - v_px[0]
-    behind_u, behind_v = u_px[2] - u_px[0], v_px[2] - v_px[0]
-    doubled_area = ahead_u * behind_v - behind_u * ahead_v  # in an image, rows go down
-    edges = np.abs(ahead_u) + np.abs(ahead_v) + np.abs(behind_u) + np.abs(behind_v)
-    is_back: Chosen = doubled_area > np.float32(2 * MARGIN_PX) * (edges + np.float32(2 * MARGIN_PX))
-    return is_back
 
 
 def _cells(place_px: Floats, n: int) -> Cells:
