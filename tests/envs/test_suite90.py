@@ -14,7 +14,8 @@ from vla_eval.config.environment import EnvSettings
 from vla_eval.config.prompts import instruction_for
 from vla_eval.core import EpisodeStart, StepResult
 from vla_eval.envs.factory import make_env
-from vla_eval.envs.official import official_class
+from vla_eval.envs.official import CAMERAS, official_class
+from vla_eval.envs.scenes import take_images
 from vla_eval.policies.context import PolicyContext
 from vla_eval.policies.registry import make_from_adapter
 from vla_eval.rollout import RolloutSettings, rollout
@@ -74,6 +75,25 @@ def test_true_states_are_as_intended_and_an_episode_depends_on_its_seed(task: st
         assert one.reward == two.reward
         for name, value in one.observation.state.items():
             np.testing.assert_array_equal(value, two.observation.state[name])
+    env.close()
+
+
+@pytest.mark.parametrize("task", OFFICIAL_TASKS)
+def test_a_camera_s_own_scene_shows_what_the_whole_scene_shows(task: str) -> None:
+    """Things are hidden and lit while an episode runs, and balls fly."""
+    cameras = tuple(camera.name for camera in CAMERAS)
+    env = make_env(EnvSettings(task=task, cameras=cameras, kwargs=STAND_IN))
+    inner = env._envs[0]  # type: ignore[attr-defined]
+    env.reset({0: 1}, render=True)
+    rng = np.random.default_rng(0)
+    for step in range(N_STEPS):
+        drawn = frozenset({0} if step % 4 == 0 else ())
+        action = np.append(rng.uniform(-1, 1, 6), 0).astype(np.float32)
+        seen = env.step({0: action}, render=drawn)[0].observation.images
+        if drawn:
+            whole = take_images(inner, cameras)
+            for camera in cameras:
+                np.testing.assert_array_equal(seen[camera], whole[camera][0])
     env.close()
 
 

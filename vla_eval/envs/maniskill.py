@@ -21,9 +21,7 @@ from vla_eval.config.environment import HUMAN_CAMERA, EnvSettings
 from vla_eval.control_modes import CONTROL_MODE
 from vla_eval.core import FloatArray, ImageArray, Observation, StepResult
 from vla_eval.cue_view import CueBoxes, PixelBox
-from vla_eval.envs.camera_view import CameraView
-from vla_eval.envs.dense_bodies import DenseBodies
-from vla_eval.envs.scenes import CPU_RENDERER, build, describe, render_backend, take_human_image, take_images
+from vla_eval.envs.scenes import build, describe, own_views, take_human_image, take_images
 from vla_eval.errors import check_names
 from vla_eval.features import IMAGE_SIZE_PX
 from vla_eval.robots.find import ROBOT, ROBOT_UIDS, action_of, control_mode_of
@@ -68,13 +66,7 @@ class ManiSkillEnv:
             robot=self._envs[0].arm.name,
         )
         self.device = describe(self._envs[0], settings)
-        # On a GPU, an image takes a hundredth of the time.
-        on_cpu = not batched and render_backend(settings) == CPU_RENDERER
-        known: DenseBodies = {}
-        self._views = [
-            {name: CameraView(name, known) for name in settings.cameras} if on_cpu else None
-            for _ in self._envs
-        ]
+        self._views = own_views(settings, n_envs)
 
     def reset(self, seeds: Mapping[int, int], *, render: bool) -> dict[int, StepResult]:
         """Begin an episode in each of the given slots; see `SimEnv.reset`."""

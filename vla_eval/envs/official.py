@@ -24,7 +24,7 @@ from vla_eval.core import FloatArray, Observation, StepResult
 from vla_eval.envs.official_assets import provide_bulb, provide_mug
 from vla_eval.envs.official_settings import BULB, MUG, WITH_LAMPS, check_official
 from vla_eval.envs.official_state import Choices, first_positions_m, read_bodies, read_candidates, to_vector
-from vla_eval.envs.scenes import build, describe, take_human_image, take_images
+from vla_eval.envs.scenes import build, describe, own_views, take_human_image, take_images
 from vla_eval.envs.true_states import TrueStates
 from vla_eval.errors import MissingDependencyError, SpecMismatchError, TaskArgumentError, check_names
 from vla_eval.oracles.arm_model import gripper_command
@@ -63,6 +63,7 @@ class OfficialEnv:
         self._envs = [
             build(cls, settings, num_envs=1, sim_backend="physx_cpu", **arm) for _ in range(settings.n_slots)
         ]
+        self._views = own_views(settings, settings.n_slots)
         self._episodes: dict[int, OfficialEpisode] = {}
         self.device |= describe(self._envs[0], settings)
         self.spec = offered_by(row, settings.kwargs)
@@ -86,7 +87,7 @@ class OfficialEnv:
         """Release the simulator."""
         for env in self._envs:
             env.close()
-        self._envs = []
+        self._envs, self._views = [], []
 
     def _begin(self, slot: int, seed: int, *, render: bool) -> StepResult:
         if not 0 <= seed <= LARGEST_SEED:
@@ -112,21 +113,22 @@ class OfficialEnv:
         episode.note(int(info["elapsed_steps"][0]))
         true_state = episode.true_state() if self._settings.privileged else None
         return StepResult(
-            observation=self._observation(self._envs[slot], info, true_state, render=render),
+            observation=self._observation(slot, info, true_state, render=render),
             status=episode.status(success=bool(info["success"][0])),
             **fields,
         )
 
     def _observation(
-        self, env: Any, info: Any, true_state: PrivilegedState | None, *, render: bool
+        self, slot: int, info: Any, true_state: PrivilegedState | None, *, render: bool
     ) -> Observation:
+        env, views = self._envs[slot], self._views[slot]
         step, robot = int(info["elapsed_steps"][0]), env.agent.robot
         state = {"tcp_pose": env.agent.tcp.pose.raw_pose, "qpos": robot.get_qpos(), "qvel": robot.get_qvel()}
         images = {}
         if render:
             for hidden in env._hidden_objects:
                 hidden.hide_visual()
-            images = take_images(env, self._settings.cameras)
+            images = take_images(env, self._settings.cameras, views)
             if self._settings.shows_human_camera(step, self.spec.horizon_steps):
                 images[HUMAN_CAMERA] = take_human_image(env)
         return Observation(

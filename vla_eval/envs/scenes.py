@@ -10,6 +10,7 @@ import torch
 from vla_eval.config.environment import EnvSettings
 from vla_eval.core import ImageArray
 from vla_eval.envs.camera_view import CameraView
+from vla_eval.envs.dense_bodies import DenseBodies
 from vla_eval.envs.shaders import check_no_environment_map, use_lean_shaders
 from vla_eval.errors import MissingDependencyError, RenderingError
 from vla_eval.strict.devices import refuse_missing_gpu
@@ -72,6 +73,18 @@ def build(cls: Any, settings: EnvSettings, **arguments: Any) -> Any:
         ) from exc
 
 
+Views = Mapping[str, CameraView]
+"""By camera."""
+
+
+def own_views(settings: EnvSettings, n_envs: int) -> list[Views | None]:
+    """Return for each environment the views that draw its images; None on a GPU, which draws them at once."""
+    if settings.sim_backend == "gpu" or render_backend(settings) != CPU_RENDERER:
+        return [None] * n_envs
+    known: DenseBodies = {}
+    return [{name: CameraView(name, known) for name in settings.cameras} for _ in range(n_envs)]
+
+
 def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
     """Return the devices of an environment by what they are for."""
     device = {"simulator": str(env.backend.sim_backend)}
@@ -84,12 +97,10 @@ def describe(env: Any, settings: EnvSettings) -> dict[str, str]:
     return device
 
 
-def take_images(
-    env: Any, cameras: tuple[str, ...], views: Mapping[str, CameraView] | None = None
-) -> dict[str, ImageArray]:
+def take_images(env: Any, cameras: tuple[str, ...], views: Views | None = None) -> dict[str, ImageArray]:
     """Return camera name -> (B, H, W, 3) uint8 of a ManiSkill environment.
 
-    `views` draw the same images faster on a CPU; None: the scene itself is drawn.
+    `views` draw the same images faster on a CPU (`own_views`); None: the scene itself is drawn.
     """
     if not cameras:
         raise RenderingError(
