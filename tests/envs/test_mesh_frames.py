@@ -8,6 +8,7 @@ import pytest
 from tests.tasks.sample import SAMPLE
 from vla_eval.config.environment import AppearanceSettings, EnvSettings, RenderSettings
 from vla_eval.core import ImageArray
+from vla_eval.envs.camera_view import CameraView
 from vla_eval.envs.factory import make_env
 from vla_eval.envs.pixel_cover import Chosen, Lens, Matrix, Mesh, covering
 from vla_eval.envs.scenes import take_images
@@ -92,6 +93,18 @@ def test_the_arm_is_drawn_where_it_may_be_seen() -> None:
         seen = take_images(inner, ("hand_camera",), views)["hand_camera"]
         np.testing.assert_array_equal(seen, take_images(inner, ("hand_camera",))["hand_camera"])
         assert (links_drawn() > beside_it) is is_seen
+    env.close()
+
+
+def test_where_a_light_casts_shadows_all_triangles_are_drawn() -> None:
+    env = make_env(EnvSettings(task="RememberColor3-v0", cameras=("base_camera",)))
+    (inner,), (views,) = env._envs, env._views
+    env.reset({0: 1}, render=True)
+    assert views["base_camera"]._culled
+    inner.scene.sub_scenes[0].render_system.lights[0].shadow = True
+    view = CameraView("base_camera", {})
+    view.submit(inner)
+    assert not view._culled
     env.close()
 
 

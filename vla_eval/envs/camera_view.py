@@ -142,8 +142,11 @@ class CameraView:
     def _dense(self, env: Any, *, is_fixed: bool) -> dict[int, DenseBody]:
         """Return the bodies with many triangles, by the numbers of their entities.
 
-        The ground only if the camera stays where it is: otherwise it would be made anew for each image.
+        The ground only if the camera stays where it is: otherwise it would be made anew for each image. None
+        where a light casts shadows: what colours no pixel may cast one.
         """
+        if any(light.shadow for light in env.scene.sub_scenes[0].render_system.lights):
+            return {}
         bodies = {f"link {link.name}": link._objs[0].entity for link in env.agent.robot.links}
         if is_fixed and GROUND in env.scene.actors:
             bodies[GROUND] = env.scene.actors[GROUND]._objs[0]
