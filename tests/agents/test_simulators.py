@@ -55,6 +55,14 @@ def test_a_training_in_several_processes_has_the_weights_of_one_in_this_process(
     assert files_of(one) == files_of(two)
 
 
+def test_a_robot_with_physics_is_simulated_in_another_process_also_by_one_worker(tmp_path: Path) -> None:
+    """SAPIEN can abort where it ends; a training that is finished has to end with 0."""
+    one = EnvSettings(task=ROBOT, n_slots=2)
+    assert isinstance(simulators(one, workers=1, is_robot=True, logs=tmp_path), Simulators)
+    base = EnvSettings(task="mikasa_base/MemoryLengthEasy-v0", n_slots=2)
+    assert not isinstance(simulators(base, workers=1, is_robot=False, logs=tmp_path), Simulators)
+
+
 def test_no_more_processes_than_slots_and_none_for_arrays_alone(tmp_path: Path) -> None:
     alone = simulators(settings(3), workers="auto", is_robot=True, logs=tmp_path)
     several = simulators(settings(3), workers=8, is_robot=True, logs=tmp_path)

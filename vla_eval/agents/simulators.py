@@ -196,10 +196,14 @@ class Simulators:
 def simulators(
     settings: EnvSettings, *, workers: int | Literal["auto"], is_robot: bool, logs: Path
 ) -> SimEnv:
-    """Return the environment of a training; `auto`: a process per core for a robot's, else in this one."""
+    """Return the environment of a training; `auto`: a process per core for a robot's, else in this one.
+
+    A robot's is never in this one: SAPIEN can abort while its process ends (a Python object is freed without
+    the interpreter's lock), and a finished training would then look like one that failed.
+    """
     has_physics = is_robot and settings.simulator != "fake"
     wanted = (available_cores() if has_physics else 1) if workers == "auto" else workers
     n_processes = min(wanted, settings.n_slots)
-    if n_processes == 1:
+    if n_processes == 1 and not has_physics:
         return make_env(settings)
     return Simulators(settings, n_processes=n_processes, logs=logs)
