@@ -14,7 +14,7 @@ import matplotlib
 matplotlib.use("Agg")
 import numpy as np
 from matplotlib import pyplot as plt
-from scipy.stats import PermutationMethod, norm, spearmanr
+from scipy.stats import norm, permutation_test, spearmanr
 
 from vla_eval.records import EpisodeRecord
 from vla_eval.storage.run_folder import read_run
@@ -99,14 +99,23 @@ def is_of(task: str, kind: str) -> bool:
 def correlation_row(kind: str, ends: dict[str, Scores], cores: list[str]) -> str:
     """Return Spearman's correlation, its 95 % interval (Bonett and Wright 2000), and a permutation test."""
     x, y = ([mean_of(ends[end][core], kind) for core in cores] for end in ENDS)
-    found = spearmanr(x, y, method=PermutationMethod(n_resamples=9999, rng=np.random.default_rng(0)))
+    counts = [str(sum(is_of(task, kind) for task in ends[end][cores[0]])) for end in ENDS]
+    without = "" if WITHOUT_MEMORY in cores else f", without `{WITHOUT_MEMORY}`"
+    row = [f"| {kind}", f"{len(cores)}{without}", *counts]
+    if len(set(x)) == 1 or len(set(y)) == 1:
+        return " | ".join([*row, "all alike at one end", " |"])
+    found = permutation_test(
+        (x,),
+        lambda one: spearmanr(one, y).statistic,
+        permutation_type="pairings",
+        vectorized=False,
+        rng=np.random.default_rng(0),
+    )
     rho = float(found.statistic)
     error = norm.ppf(0.975) * np.sqrt((1 + rho**2 / 2) / (len(cores) - 3))
     low, high = np.tanh(np.arctanh(np.clip(rho, -0.9999, 0.9999)) + np.array([-error, error]))
-    counts = [str(sum(is_of(task, kind) for task in ends[end][cores[0]])) for end in ENDS]
-    without = "" if WITHOUT_MEMORY in cores else f", without `{WITHOUT_MEMORY}`"
     shown = f"{rho:.2f} [{low:.2f}, {high:.2f}]".replace("-", MINUS)
-    return " | ".join([f"| {kind}", f"{len(cores)}{without}", *counts, shown, f"{found.pvalue:.3f} |"])
+    return " | ".join([*row, shown, f"{found.pvalue:.3f} |"])
 
 
 def table(scores: Scores) -> str:
