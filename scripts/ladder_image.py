@@ -27,6 +27,7 @@ TYPES = ("object", "sequential", "capacity")
 IN_ORDER = "sequential"  # the robot tasks of this type ask for an order
 MINUS = "\N{MINUS SIGN}"
 SIZE_IN, DPI = 3.1, 150
+MARKERS = "osD^v<>Ph"  # many points lie on each other
 Scores = dict[str, dict[str, float]]  # core -> task -> score
 
 
@@ -45,12 +46,13 @@ def main() -> None:
             print(correlation_row(kind, ends, chosen))
         for number, core in enumerate(cores):
             place = tuple(mean_of(ends[end][core], kind) for end in ENDS)
-            axes.plot(*place, "o", color=plt.get_cmap("tab10")(number))
-            axes.annotate(core, place, textcoords="offset points", xytext=(4, 3), fontsize=7)
+            colour = plt.get_cmap("tab10")(number)
+            axes.plot(*place, MARKERS[number], color=colour, alpha=0.8, label=core if kind == "all" else None)
         axes.axhline(0, color="0.8", zorder=0)
         axes.axvline(0, color="0.8", zorder=0)
         axes.set(title=kind, xlabel="score on diagnostic tasks", xlim=(-0.35, 1.2))
     panels[0].set(ylabel="score on robot tasks")
+    figure.legend(loc="outside right center")
     figure.savefig(target, dpi=DPI)
 
 
