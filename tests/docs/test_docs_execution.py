@@ -51,7 +51,7 @@ NOT_EXECUTED: Mapping[str, str] = {
         "joints and arms, which the fake simulator has not; tests/data/test_record_maniskill.py"
     ),
     r"eval .*--delay-trace .*": "a run whose delays were measured; tests/evaluation/test_delays.py",
-    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/(memory|base_table)/.*": (
+    r"train-agent .*|eval .* runs/(bit|rc3) .*|eval runs/(memory|base_table|ladder_\w+)/.*": (
         "trained agents; tests/agents/test_agents_as_policies.py"
     ),
     r"audit --stored-frames.*": "twenty episodes at least; tests/audit/test_stored_frames.py",
