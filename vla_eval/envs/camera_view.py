@@ -1,9 +1,9 @@
 """A scene of its own for a camera, with the triangles that colour a pixel: the same image in half the time.
 
 On a CPU, a small image takes as long as its triangles. Of 245,000 the arm has 225,000, and hardly one in ten
-of these covers the centre of a pixel. They are found for each image (`pixel_cover`), and the arm's links are
-made anew of them. Where the same ones are left as in the image before, as of links that are out of view, none
-is made: SAPIEN would record its commands again, which takes as long as 15,000 triangles.
+of these covers the centre of a pixel. They are found for each image (`pixel_cover`), and links are made of
+them. Where the same ones are left as in the image before, as of links that are out of view, none is made:
+SAPIEN would record its commands again, which takes as long as 15,000 triangles.
 """
 
 from typing import Any  # SAPIEN and ManiSkill are untyped: their scenes, entities and components are Any here
@@ -142,7 +142,7 @@ class CameraView:
     def _dense(self, env: Any, *, is_fixed: bool) -> dict[int, DenseBody]:
         """Return the bodies with many triangles, by the numbers of their entities.
 
-        The ground only if the camera stays where it is: otherwise it would be made anew for each image. None
+        The ground only if the camera stays where it is: otherwise it would be made again for each image. None
         where a light casts shadows: what colours no pixel may cast one.
         """
         if any(light.shadow for light in env.scene.sub_scenes[0].render_system.lights):

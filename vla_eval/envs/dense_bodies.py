@@ -103,7 +103,7 @@ def _parts(body: Any) -> Iterator[tuple[Any, Any]]:
 
 
 def is_dense(entity: Any) -> bool:
-    """Return whether a body is of many triangles, and can be made anew from arrays with the same pixels."""
+    """Return whether a body is of many triangles, and can be made from arrays with the same pixels."""
     body = rendered(entity)
     if body is None:
         return False
