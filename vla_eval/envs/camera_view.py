@@ -57,7 +57,8 @@ class _Shown:
         if self._seen_from is not None and np.abs(view - self._seen_from).max() <= still:
             return False
         self._seen_from = view
-        chosen = self._chosen & False if is_outside else covering(self.dense.mesh, view, lens)
+        nothing = np.zeros_like(self._chosen)
+        chosen = nothing if is_outside else covering(self.dense.mesh, view, lens)
         if np.array_equal(chosen, self._chosen):
             return False
         self._chosen, self.copy = chosen, None
@@ -113,6 +114,7 @@ class CameraView:
             _Shown(one, dense.get(one.per_scene_id)) for one in whole.entities if rendered(one) is not None
         ]
         self._culled = [one for one in self._shown if one.dense is not None]
+        self._boxes = np.array([one.dense.box for one in self._shown if one.dense is not None])
         self._added: list[Any] = []
         self._of = env.scene
 
@@ -122,9 +124,7 @@ class CameraView:
             return False
         to_camera = (self._original.entity.pose * self._original.local_pose).inv()
         views = np.stack([(to_camera * one.entity.pose).to_transformation_matrix() for one in self._culled])
-        outside = _is_outside(
-            np.stack([one.dense.box for one in self._culled if one.dense]), views, self._lens
-        )
+        outside = _is_outside(self._boxes, views, self._lens)
         changed = [
             one.choose(view, self._lens, is_outside=bool(is_outside))
             for one, view, is_outside in zip(self._culled, views, outside, strict=True)
