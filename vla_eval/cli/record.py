@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DATA_FOLDER = Path("data")
 FINGERPRINT_DIGITS = 8
 MEGABYTE = 1_000_000
-STEPS_PER_SECOND = 7  # a core, software rendering; docs/datasets.md: 24.8 steps in 3.4 s
+STEPS_PER_SECOND = 25  # a worker, software rendering; docs/datasets.md: 25.4 steps in 0.9 s
 BYTES_PER_STEP = 11_000  # docs/datasets.md: 70 MB of 6,200 frames
 DESCRIPTION = """Record demonstrations of a scripted expert as LeRobot datasets, one per task: OUT/TASK.
 

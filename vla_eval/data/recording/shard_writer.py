@@ -22,6 +22,7 @@ from vla_eval.data.exact_statistics import (
 )
 from vla_eval.data.manifest import MIKASA_FOLDER, ArmEpisode, RecordedEpisode, read_entries, write_lines
 from vla_eval.data.opening import join_datasets, video_decoder
+from vla_eval.data.recording.episode_statistics import use_exact_statistics
 from vla_eval.data.tables import read_columns
 from vla_eval.errors import DatasetError
 from vla_eval.features import FPS, EncoderSettings
@@ -124,6 +125,7 @@ def new_dataset(
 ) -> Any:  # Any: lerobot's plain data, and lerobot
     """Return a new LeRobotDataset of these fields to write episodes of up to `max_frames` into."""
     av.logging.set_libav_level(av.logging.ERROR)  # else twenty lines for each video
+    use_exact_statistics()
     return LeRobotDataset.create(
         repo_id=f"local/{root.name}",
         fps=fps,
