@@ -28,6 +28,9 @@ POSITION = ".pos"
 ABSOLUTE_MODES = (JOINT_POS, EE_POSE)
 """Their actions are where the arm is to be, not how far it is to move."""
 
+TRANSLATING_MODES = (EE_DELTA_POSE, EE_DELTA_POS)
+"""Their actions begin with how far the tool is to move."""
+
 DELTA_M, DELTA_RAD = 0.1, 0.1
 """What 1 means in a delta mode. ManiSkill multiplies rotations by their lower bound, so their sign is
 inverted."""

@@ -24,11 +24,11 @@ def _seeded() -> Iterator[None]:
         yield
 
 
-def config(**fields: object) -> MikasaSequenceConfig:
+def config(*, window_steps: int = N_STEPS, **fields: object) -> MikasaSequenceConfig:
     image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, EDGE_PX, EDGE_PX))
     return MikasaSequenceConfig(
         device="cpu",
-        window_steps=N_STEPS,
+        window_steps=window_steps,
         waiting_share=1.0,
         input_features={
             **dict.fromkeys(CAMERAS, image),
@@ -219,6 +219,77 @@ class TestMotions:
         actions = torch.ones(1, 6, 7)
         real = torch.tensor([[False, False, True, True, True, True]])
         assert count_motions(actions, real).tolist() == [1]
+
+
+class TestGoals:
+    """The goal of a step is where the demonstration ends, or where its motion does."""
+
+    SIZES = (0, 0, 1, 0.6, 1.2, 0.4, 0.2, 1)  # waits; sets out at 2, 4 and 7
+
+    def given(self, sizes: tuple[float, ...], *, n_real: int) -> dict[str, Tensor]:
+        n_steps, n_actions = len(sizes), len(sizes) - 1 + CHUNK
+        actions = torch.zeros(2, n_actions, 7)
+        actions[:, :n_steps, 0] = torch.tensor(sizes)
+        state = torch.zeros(2, n_steps + 1, 10)
+        state[:, :, 0] = torch.arange(n_steps + 1)  # the tool is at x = t at step t
+        state[:, n_real:, 0] = n_real - 1  # beyond the episode LeRobot repeats its last frame
+        images = torch.rand(2, n_steps + 1, 3, EDGE_PX, EDGE_PX)
+        is_pad = torch.zeros(2, n_steps + 1, dtype=torch.bool)
+        is_pad[:, n_real:] = True
+        return {
+            **dict.fromkeys(CAMERAS, images),
+            STATE_KEY: state,
+            f"{STATE_KEY}_is_pad": is_pad,
+            ACTION_KEY: actions,
+            ACTION_PADDING_KEY: torch.zeros(2, n_actions, dtype=torch.bool),
+        }
+
+    def goals(self, sizes: tuple[float, ...], *, each_motion: bool, n_real: int | None = None) -> list[float]:
+        n_real = n_real or len(sizes)
+        given = self.given(sizes, n_real=n_real)
+        made = config(window_steps=len(sizes), masks_beyond_decision=True)
+        episodes = episodes_of(given, made, training=False, each_motion=each_motion)
+        goals: list[float] = episodes.goal_m[0, :n_real, 0].tolist()
+        return goals
+
+    def test_a_demonstration_has_one(self) -> None:
+        assert self.goals(self.SIZES, each_motion=False) == [7] * 8
+
+    def test_each_motion_has_one_and_the_first_is_that_of_waiting(self) -> None:
+        assert self.goals(self.SIZES, each_motion=True) == [4, 4, 4, 4, 7, 7, 7, 7]
+
+    def test_an_arm_that_moves_once_has_that_of_the_demonstration(self) -> None:
+        sizes = (0, 0, 1, 0.6, 0.3, 0.1)
+        assert self.goals(sizes, each_motion=True) == self.goals(sizes, each_motion=False) == [5] * 6
+
+    def test_an_arm_that_never_moves_has_that_of_the_demonstration(self) -> None:
+        assert self.goals((0, 0, 0, 0), each_motion=True) == [3] * 4
+
+    def test_what_comes_after_a_shorter_episode_is_no_motion(self) -> None:
+        assert self.goals((0, 1, 0.3, 1, 0.2, 0, 1), each_motion=True, n_real=5) == [3, 3, 3, 4, 4]
+
+    def test_a_motion_begins_with_a_decision_that_an_earlier_chunk_cannot_know(self) -> None:
+        given = self.given(self.SIZES, n_real=8)
+        made = config(window_steps=8, masks_beyond_decision=True, change_weight=0.0)
+
+        counted = {
+            each: (episodes_of(given, made, training=False, each_motion=each).counts[0] > 0).sum(dim=-1)
+            for each in (False, True)
+        }
+
+        assert counted[False].tolist() == [2, 1, *[CHUNK] * 6]  # what follows the one decision, at 2
+        assert counted[True].tolist() == [2, 1, 2, 1, 3, 2, 1, CHUNK]  # up to 2, 4 and 7
+
+    def test_samples_end_at_each_of_them(self) -> None:
+        given, ends = self.given(self.SIZES, n_real=8), set()
+        made = config(window_steps=8, decision_share=1.0)
+        for _ in range(20):
+            episodes = episodes_of(given, made, training=True, each_motion=True)
+            ends |= {
+                int(steps[counts[:, 0] > 0].max())
+                for steps, counts in zip(episodes.steps, episodes.counts, strict=True)
+            }
+        assert ends == {2, 4, 7}
 
 
 class TestWaitingOn:

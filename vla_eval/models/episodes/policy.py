@@ -29,13 +29,22 @@ class EpisodePolicy(PreTrainedPolicy):  # type: ignore[misc]  # lerobot is untyp
         if config.erase_warmup_episodes:
             self.register_buffer("n_trained", torch.zeros((), dtype=torch.int64))
 
-    def samples(self, batch: dict[str, Tensor], *, same_action: float = SAME_ACTION) -> Episodes:
+    def samples(
+        self, batch: dict[str, Tensor], *, same_action: float = SAME_ACTION, each_motion: bool = False
+    ) -> Episodes:
         """Return the steps of a batch to train on, see `episodes_of`; training counts the samples."""
         config, may_stay = self.config, 1.0
         if self.training and config.erase_warmup_episodes:
             may_stay = min(1.0, int(self.n_trained) / config.erase_warmup_episodes) ** 2
             self.n_trained += len(batch[ACTION_KEY])
-        return episodes_of(batch, config, training=self.training, same_action=same_action, may_stay=may_stay)
+        return episodes_of(
+            batch,
+            config,
+            training=self.training,
+            same_action=same_action,
+            may_stay=may_stay,
+            each_motion=each_motion,
+        )
 
     def declare_memory(self, begin: Any, *, remembers: bool) -> None:
         """Give the policy the methods of one that remembers; `begin` makes the memory of so many episodes."""

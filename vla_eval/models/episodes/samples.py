@@ -35,7 +35,8 @@ class Episodes(NamedTuple):
     actions: Tensor  # (B, T, chunk, action)
     counts: Tensor  # (B, T, chunk) float, 0 for what is beyond the episode
     goal_counts: Tensor  # (B, T) float, how much the goal counts at each step
-    goal_m: Tensor  # (B, 3) the tool centre point at the episode's end
+    # (B, T, 3) the tool centre point where the episode ends, or the motion that a step is in or comes before
+    goal_m: Tensor
     steps: Tensor  # (B, T) which step of the window each is
     # (B, T) whether the arm has only waited before this step, so that waiting on leaves the world as it is
     rests: Tensor
@@ -82,12 +83,14 @@ def episodes_of(
     training: bool,
     same_action: float = SAME_ACTION,
     may_stay: float = 1.0,
+    each_motion: bool = False,
 ) -> Episodes:
     """Return the steps to train on, moved together: those of the episode, most waiting left out.
 
     In training, at random by torch's generator: waiting is left out, some episodes end at a decision, things
     and colours change and images move. Otherwise every step is taken. Images are in [0, 1], or bytes; actions
-    that differ by less than `same_action` are waiting.
+    that differ by less than `same_action` are waiting. With `each_motion` each motion has a goal and begins
+    with a decision, whether the arm waited before it or not.
     """
     n_steps = config.n_window_steps
     real = ~batch[f"{STATE_KEY}_is_pad"][:, :n_steps]
@@ -95,6 +98,8 @@ def episodes_of(
     change = _change(actions[:, :, 0], real)
     waits = change < same_action
     begins = _begins(waits, real)
+    motions = _motions(actions[:, :, 0], real) if each_motion else torch.zeros_like(begins)
+    begins = begins | motions
     kept = _kept(waits, begins, real, config) if training else real
     counts = (~batch[ACTION_PADDING_KEY]).float().unfold(1, config.chunk_size, 1)
     can_know = torch.ones_like(change)
@@ -130,7 +135,7 @@ def episodes_of(
         actions=taken(actions),
         counts=counts,
         goal_counts=counts.sum(dim=-1) * taken(can_know),
-        goal_m=batch[STATE_KEY][:, n_steps, :SPACE],
+        goal_m=taken(_goals_m(batch[STATE_KEY][..., :SPACE], motions)),
         steps=steps,
         rests=taken(_rests(waits, batch[STATE_KEY][:, :n_steps, :SPACE])),
         waiting=actions[:, 0, 0],
@@ -149,10 +154,30 @@ def _rests(waits: Tensor, place_m: Tensor) -> Tensor:
 
 def count_motions(actions: Tensor, real: Tensor) -> Tensor:
     """Return (B,): how often the arm begins to move; actions (B, T, action) begin with a translation."""
+    return _motions(actions, real).sum(dim=1)
+
+
+def _motions(actions: Tensor, real: Tensor) -> Tensor:
+    """Return (B, T): whether the arm begins to move at a step, whatever it did before."""
     sizes = actions[..., :SPACE].norm(dim=-1) * real
     rises = sizes.diff(dim=1, prepend=torch.zeros_like(sizes[:, :1]))
-    n_motions: Tensor = (rises > MOTION_BEGINS).sum(dim=1)
-    return n_motions
+    begins: Tensor = rises > MOTION_BEGINS
+    return begins
+
+
+def _goals_m(places_m: Tensor, motions: Tensor) -> Tensor:
+    """Return (B, T, 3): where the motion of each step ends; before the first one, where that does.
+
+    `places_m` (B, T + 1, 3): of the tool, the last one at the episode's end. A motion ends where the next
+    one of `motions` (B, T) begins, the last one, or all if there is none, at the episode's end.
+    """
+    n_steps = motions.shape[1]
+    so_far = motions.cumsum(dim=1)
+    # Of each step, the number of the motion that ends its own: the second one, for all before that.
+    wanted = so_far.clamp(min=1) + 1
+    # The first step at which so many have begun; one beyond the steps, where there are not so many.
+    ends = torch.searchsorted(so_far.contiguous(), wanted.contiguous(), right=False)
+    return places_m.gather(1, ends.clamp(max=n_steps)[..., None].expand(-1, -1, SPACE))
 
 
 def _first(steps: Tensor, is_there: Tensor) -> Tensor:
@@ -210,9 +235,9 @@ def _augmented(images: Tensor, episodes: Tensor, config: EpisodeConfig, *, n_epi
 
 
 def goal_missed(goal_m: Tensor, right_m: Tensor, weights: Tensor) -> Tensor:
-    """Return the squared error of goals (B, T, 3), weighted (B, T), in units of the batch's variance."""
-    missed = (goal_m - right_m[:, None]).square().mean(dim=-1)
-    return weighted_mean(missed, weights) / goal_variance(right_m)
+    """Return the squared error of goals (B, T, 3), weighted (B, T), in units of the last ones' variance."""
+    missed = (goal_m - right_m).square().mean(dim=-1)
+    return weighted_mean(missed, weights) / goal_variance(right_m[:, -1])
 
 
 def goal_variance(right_m: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from typing import Any  # lerobot is untyped
 
 from lerobot.configs import PreTrainedConfig
 
-from vla_eval.control_modes import CONTROL_MODES, EE_DELTA_POS, EE_DELTA_POSE, JOINT_POS
+from vla_eval.control_modes import CONTROL_MODES, JOINT_POS, TRANSLATING_MODES
 from vla_eval.errors import RecipeError, SpecMismatchError, check_names
 from vla_eval.features import CAMERA_KEYS
 from vla_eval.models.episodes.config import EpisodeConfig
@@ -13,7 +13,7 @@ from vla_eval.models.memory.sizes import SPOTS
 from vla_eval.models.shared.stages import EPISODE_STEPS, HEAD, VISION, Stage, Stages, image_shape
 
 TYPE = "mikasa_memory"
-LEARNED_MODES = (EE_DELTA_POSE, EE_DELTA_POS, JOINT_POS)
+LEARNED_MODES = (*TRANSLATING_MODES, JOINT_POS)
 
 
 @PreTrainedConfig.register_subclass(TYPE)

@@ -58,7 +58,7 @@ class MikasaMemoryPolicy(EpisodePolicy):
         errors = (answer.actions - episodes.actions).square().mean(dim=-1)
         imitation = weighted_mean(errors, episodes.counts)
         has_goal = real & self._has_one_goal(batch)[:, None] if config.goal_of_one_motion else real
-        goal, goals = goals_missed(answer, episodes.goal_m, has_goal.float())
+        goal, goals = goals_missed(answer, episodes.goal_m[:, -1], has_goal.float())
         if self.training and has_goal.any():
             self._note_errors(answer, episodes, has_goal)
         # The mean of an exponential distribution, by its likelihood: errors of all sizes count alike.
@@ -76,7 +76,7 @@ class MikasaMemoryPolicy(EpisodePolicy):
 
     @torch.no_grad()
     def _note_errors(self, answer: Answer, episodes: Episodes, real: Tensor) -> None:
-        missed = by_camera(answer.pointed_m, answer.shares) - episodes.goal_m[:, None, None]
+        missed = by_camera(answer.pointed_m, answer.shares) - episodes.goal_m[:, :, None]
         self.network.goal.note_errors(missed[real], answer.evidence[real], episodes.state[real])
 
     @torch.no_grad()
@@ -135,7 +135,7 @@ def goals_missed(answer: Answer, right_m: Tensor, real: Tensor) -> tuple[Tensor,
     of_cameras = (answer.shares * of_look_ups).sum(dim=-1)
     by_all = (answer.camera_shares * of_cameras).sum(dim=-1)
     loss = weighted_mean((by_all + of_cameras.mean(dim=-1)) / 2, real) / goal_variance(right_m)
-    return goal_missed(answer.goal_m, right_m, real), loss
+    return goal_missed(answer.goal_m, right_m[:, None], real), loss
 
 
 def network_sizes(config: MikasaMemoryConfig) -> NetworkSizes:

@@ -9,7 +9,8 @@ import numpy as np
 from lerobot.configs import PreTrainedConfig
 from numpy.typing import NDArray
 
-from vla_eval.errors import RecipeError
+from vla_eval.control_modes import TRANSLATING_MODES
+from vla_eval.errors import RecipeError, SpecMismatchError
 from vla_eval.features import REWARD_KEY, SUCCESS_KEY, RewardKind
 from vla_eval.models.cores.sizes import BELOW_ONE, CORES, check_core
 from vla_eval.models.episodes.config import EpisodeConfig
@@ -37,6 +38,9 @@ class MikasaSequenceConfig(EpisodeConfig):
     # in training, up to so many first actions of a chunk are given (drawn), and only the rest is learned: for
     # chunking.mode=prefix. Half of those given while the arm has only waited are of waiting on.
     prefix_steps: int = 0
+    # the goal is where the motion under way ends, or the next one, not the demonstration; each motion begins
+    # with a decision. For tasks in which several things are touched in turn: `docs/capacity.md`.
+    goal_of_each_motion: bool = False
     tokens: str = "step"  # of a step, a name of `TOKENS`
     state_in_token: bool = True  # the token of an observation has the state in it, not only the images
     reward: str | None = None  # whose return to go is a token, a `RewardKind`. None: no token needs one.
@@ -102,6 +106,15 @@ class MikasaSequenceConfig(EpisodeConfig):
         if self.target_return is None:
             raise ValueError(f"'{TYPE}': target_return is not set (`mikasa-vla finetune` sets it)")
         return self.target_return
+
+    def fit_to_control_mode(self, mode: str) -> None:
+        """Raise `SpecMismatchError` for actions that do not say where a motion begins."""
+        if self.goal_of_each_motion and mode not in TRANSLATING_MODES:
+            raise SpecMismatchError(
+                "goal_of_each_motion is true: expected actions that translate the tool "
+                f"({', '.join(TRANSLATING_MODES)}), found those of {mode}. Set policy.goal_of_each_motion to "
+                "false."
+            )
 
     def fit_to_rewards(self, columns: Mapping[str, NDArray[Any]]) -> None:
         """Take the target return from a dataset's frames, by field (N,), where it is not given."""

@@ -174,7 +174,7 @@ class MikasaSequencePolicy(EpisodePolicy):
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Return the loss of a batch of training samples, and its parts."""
         config, network = self.config, self.network
-        episodes = self.samples(batch)
+        episodes = self.samples(batch, each_motion=config.goal_of_each_motion)
         # Images are most of the work: each is encoded once, those of padding not at all.
         first = episodes.first
         said = said_at_each_step(network.sentence, batch, first.shape[1])
