@@ -2,6 +2,7 @@
 
 import importlib.metadata
 import json
+import py_compile
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -56,6 +57,27 @@ def test_a_crash_in_a_probe_is_a_finding_with_advice(name: str) -> None:
 class TestPackages:
     def test_this_environment_has_what_the_project_requires(self) -> None:
         assert packages.check_packages(healthy).status != "fail"
+
+    @pytest.mark.parametrize(
+        ("writes", "compiled", "status"),
+        [(True, False, "ok"), (True, True, "ok"), (False, True, "ok"), (False, False, "warn")],
+    )
+    def test_a_python_that_compiles_its_imports_each_time_is_a_warning(
+        self, writes: bool, compiled: bool, status: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        package = tmp_path / "largest_package"
+        (package / "__pycache__").mkdir(parents=True)
+        (package / "__init__.py").write_text("")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        monkeypatch.setattr(packages, "LARGEST", package.name)
+        if compiled:
+            py_compile.compile(str(package / "__init__.py"))
+        monkeypatch.setattr(sys, "dont_write_bytecode", not writes)
+
+        finding = packages.check_python(healthy)
+
+        assert finding.status == status
+        assert ("compileall" in finding.advice) == (status == "warn")
 
     def test_a_missing_package_and_a_version_out_of_range_are_named(
         self, monkeypatch: pytest.MonkeyPatch

@@ -1,7 +1,9 @@
 """Checks of Python and the installed packages."""
 
 import importlib.metadata
+import importlib.util
 import sys
+from pathlib import Path
 
 from packaging.requirements import Requirement
 from packaging.version import InvalidVersion, Version
@@ -11,14 +13,27 @@ from vla_eval.storage.provenance import PACKAGE_FOLDER, package_version
 
 DISTRIBUTION = "mikasa-vla-eval"
 MINIMAL_PYTHON, NEWEST_PYTHON = (3, 12), (3, 13)  # as in pyproject.toml
+LARGEST = "torch"  # it takes longest to compile
 
 
 def check_python(_: Probe) -> Finding:
     """Whether this is a Python that the dependencies exist for."""
     found = f"{sys.version.split()[0]}"
-    if MINIMAL_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON:
-        return Finding(status="ok", found=found)
-    return Finding(status="fail", found=found, advice=f"3.12 or 3.13 is needed. {SET_UP}")
+    if not MINIMAL_PYTHON <= sys.version_info[:2] <= NEWEST_PYTHON:
+        return Finding(status="fail", found=found, advice=f"3.12 or 3.13 is needed. {SET_UP}")
+    if sys.dont_write_bytecode and not _is_compiled(LARGEST):
+        return Finding(
+            status="warn",
+            found=f"{found}, writes no compiled files",
+            advice=f"Each command takes seconds longer. Unset PYTHONDONTWRITEBYTECODE, or compile once: "
+            f"{sys.executable} -m compileall -q {sys.prefix}/lib",
+        )
+    return Finding(status="ok", found=found)
+
+
+def _is_compiled(package: str) -> bool:
+    spec = importlib.util.find_spec(package)
+    return spec is None or spec.cached is None or Path(spec.cached).exists()
 
 
 def check_packages(_: Probe) -> Finding:
