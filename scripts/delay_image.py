@@ -6,6 +6,7 @@ python scripts/delay_image.py docs/images/real_time.png runs/delays/*
 import sys
 from collections import defaultdict
 from pathlib import Path
+from typing import Any  # of matplotlib
 
 import matplotlib
 
@@ -18,7 +19,14 @@ from vla_eval.results.report import Row, build_table
 from vla_eval.storage.run_folder import read_run
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00")  # Okabe and Ito
-EXECUTIONS = {"skip": (":", "x"), "stale": ("-", "o"), "wait": ("--", "s"), "prefix": ("-.", "^")}
+ENSEMBLE = "temporal_ensemble"  # another execution without a delay, too
+EXECUTIONS: dict[str, tuple[Any, str]] = {
+    "skip": (":", "x"),
+    "stale": ("-", "o"),
+    "wait": ("--", "s"),
+    "prefix": ("-.", "^"),
+    ENSEMBLE: ((0, (6, 1, 1, 1, 1, 1)), "d"),
+}
 WIDTH_IN, HEIGHT_IN, LEGEND_IN, DPI = 4.5, 3.0, 1.5, 150
 Cells = dict[tuple[int, str, str], dict[int, Row]]
 
@@ -66,7 +74,7 @@ def main() -> None:
 
 
 def _read(sources: list[Path]) -> Cells:
-    """Return K, policy, execution -> delay -> row; without a delay, all executions are one."""
+    """Return K, policy, execution -> delay -> row; without a delay, all others are one."""
     cells: Cells = defaultdict(dict)
     without: list[Row] = []
     for source in sources:
@@ -75,13 +83,13 @@ def _read(sources: list[Path]) -> Cells:
         delay, mode = chunking.get("delay", chunking.get("delay_steps")), chunking["mode"]
         execution = chunking["delay_alignment"] if mode == "receding_horizon" else mode
         for row in build_table([run]).rows:
-            if delay:
-                cells[row.n_action_steps, row.policy, execution][delay] = row
+            if delay or execution == ENSEMBLE:
+                cells[row.n_action_steps, row.policy, execution][delay or 0] = row
             else:
                 without.append(row)
     for (k, policy, _), rows in cells.items():
         own = [row for row in without if (row.n_action_steps, row.policy) == (k, policy)]
-        if own:
+        if own and 0 not in rows:
             rows[0] = own[0]
     return cells
 

@@ -1,7 +1,9 @@
 """The laws of the scripted experts, without a simulator."""
 
+import itertools
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,15 @@ from vla_eval.oracles.arm_model import action_row, wrapped_rad
 from vla_eval.task_state import BodyState, PrivilegedState
 
 ZERO = np.zeros(3)
+BALL_TACTICS = (cradle.SLOW, cradle.MEDIUM, cradle.FAST, catch.SLOW, catch.MEDIUM, catch.FAST)
+SPEEDS_M_S = (
+    0.0,
+    5e-324,
+    1e-9,
+    0.5,
+    -1e-9,
+    -0.5,
+)  # at rest, asleep but for a rounding, rolling, rolling back
 
 
 def still(**bodies: BodyState) -> PrivilegedState:
@@ -92,9 +103,36 @@ def test_the_cube_is_brought_back_only_after_it_was_on_the_disc() -> None:
     assert push_x(0.05) > 0 > push_x(0.20)
 
 
-@pytest.mark.parametrize(
-    "tactics", [cradle.SLOW, cradle.MEDIUM, cradle.FAST, catch.SLOW, catch.MEDIUM, catch.FAST]
-)
+def acts(tactics: Any, state: PrivilegedState, *, imagined: bool = False) -> None:
+    """Check that an expert has actions for a state, at the first look at it and later ones."""
+    expert = tactics(rng=np.random.default_rng(1), imagined=imagined)
+    for step in (0, 20, 40):
+        rows = expert.plan(state, step, 16)
+        assert np.isfinite(rows).all() and np.abs(rows).max() <= 1
+
+
+@pytest.mark.parametrize(("v_x", "v_y"), list(itertools.product(SPEEDS_M_S, repeat=2)))
+@pytest.mark.parametrize("tactics", BALL_TACTICS)
+def test_there_is_an_action_whatever_the_ball_does(
+    tactics: cradle.CradleTactics, v_x: float, v_y: float
+) -> None:
+    for x, y in ((-0.2, -0.4), (-0.07, 0.0), (0.0, 0.0), (5.0, 9.0)):  # in its lane, at the hand, far away
+        ball = BodyState(
+            position_m=np.array([x, y, 0.02]), velocity_m_s=np.array([v_x, v_y, 0.0]), yaw_rad=0.0
+        )
+        for imagined in (False, True):
+            acts(tactics, still(ball=ball, goal=body(0.0, 0.0)), imagined=imagined)
+
+
+@pytest.mark.parametrize("imagined", [False, True])
+@pytest.mark.parametrize("make", [carry.CUBE, turn.PEG, turn.PEG_SIGNED])
+def test_there_is_an_action_where_all_things_are_in_one_place(make: Any, imagined: bool) -> None:
+    for x, y in ((0.0, 0.0), (-0.07, 0.0), (-0.615, 0.0), (5.0, 9.0)):
+        here = body(x, y)
+        acts(make, still(cube=here, goal=here, first_place=here, peg=here), imagined=imagined)
+
+
+@pytest.mark.parametrize("tactics", BALL_TACTICS)
 def test_a_ball_that_cannot_be_seen_yet_changes_nothing(tactics: cradle.CradleTactics) -> None:
     plans = []
     for start_y in (-0.9, -0.65):

@@ -10,7 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from vla_eval.oracles import arm_model as model
-from vla_eval.oracles.cradle import IMAGINED_VELOCITY_X_M_S, IMAGINED_Y_M, ROLLING_SHARE, UNSEEN_STEPS
+from vla_eval.oracles.cradle import (
+    IMAGINED_VELOCITY_X_M_S,
+    IMAGINED_Y_M,
+    ROLLING_SHARE,
+    UNSEEN_STEPS,
+    lane_x_m,
+)
 from vla_eval.task_state import PrivilegedState
 
 HOVER_M = 0.075  # of the tool centre point over the table: fingertips above the ball's top
@@ -114,9 +120,8 @@ def _command(play: _Play) -> model.Vector:
 
 def _waiting_place_m(play: _Play) -> model.Vector:
     """Return (x, y) over the ball's lane where the arm waits for it."""
-    v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
     y = play.meet_y_m
-    x = float(play.ball_m[0]) + v_x * (y - float(play.ball_m[1])) / v_y
+    x = lane_x_m(play.ball_m, play.ball_velocity_m_s, y)
     from_base_x = x - BASE_X_M
     if np.hypot(from_base_x, y) < MIN_REACH_M:
         y = -float(np.sqrt(max(MIN_REACH_M**2 - from_base_x**2, 0.0)))

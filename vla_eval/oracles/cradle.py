@@ -168,13 +168,20 @@ def _command(play: _Play) -> model.Vector:
     return np.array([forward, _next_side_speed_m_s(play) + tracking, height])
 
 
+def lane_x_m(ball_m: model.Vector, velocity_m_s: model.Vector, y_m: float) -> float:
+    """Return the x at which a ball's lane crosses `y_m`: its own x, if it does not roll along y."""
+    x, y = (float(place) for place in ball_m)
+    v_x, v_y = (float(v) for v in velocity_m_s)
+    return x + v_x * (y_m - y) / v_y if v_y else x
+
+
 def _waiting_place_m(play: _Play) -> model.Vector:
     """Return (x, y) next to the lane from which a push carries the ball to the goal."""
     lane_x = float(play.ball_m[0])
-    v_x, v_y = (float(v) for v in play.ball_velocity_m_s)
+    v_y = float(play.ball_velocity_m_s[1])
     run_up_y = float(play.goal_m[0] - lane_x) * v_y / PUSH_SPEED_M_S + MEET_Y_EXTRA_M
     meet_y = max(float(play.goal_m[1]) - run_up_y, MEET_Y_MIN_M)
-    x = lane_x + v_x * (meet_y - float(play.ball_m[1])) / v_y - LANE_OFFSET_M
+    x = lane_x_m(play.ball_m, play.ball_velocity_m_s, meet_y) - LANE_OFFSET_M
     from_base_x = x - BASE_X_M
     min_reach_m = play.tactics.min_reach_m
     if np.hypot(from_base_x, meet_y) < min_reach_m:
