@@ -108,6 +108,10 @@ def test_a_policy_of_another_package_may_read_every_step(bench: Bench) -> None:
 def test_hours_are_those_of_the_stated_rates() -> None:
     effort = evaluation_effort(config(), out=Path("nowhere"))
     assert effort.seconds(AssumedRates(steps_per_second=10, inference_seconds=1)) == pytest.approx(48)
+    learned = dataclasses.replace(config(), policies=("memory_color3",), n_action_steps=(6,))
+    rates = AssumedRates(steps_per_second=10, frames_per_second=4, inference_seconds=1)
+    # Two episodes: 120 steps, 240 images, 20 inferences.
+    assert evaluation_effort(learned, out=Path("nowhere")).seconds(rates) == pytest.approx(12 + 60 + 20)
 
 
 def test_the_command_prints_what_would_run(

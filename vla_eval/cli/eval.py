@@ -116,7 +116,13 @@ def _add_dry_run_arguments(parser: argparse.ArgumentParser) -> None:
         "--steps-per-second",
         type=positive_argument,
         metavar="N",
-        help="with --dry-run: control steps of a worker to assume (20)",
+        help="with --dry-run: control steps of a worker without images to assume (500)",
+    )
+    parser.add_argument(
+        "--frames-per-second",
+        type=positive_argument,
+        metavar="N",
+        help="with --dry-run: images of a worker to assume (50)",
     )
     parser.add_argument(
         "--inference-seconds",
@@ -201,7 +207,8 @@ def run(args: argparse.Namespace) -> int:
 def _dry_run(resolved: "ResolvedEvaluation", args: argparse.Namespace) -> int:
     from vla_eval.evaluation.dry_run import AssumedRates, describe_evaluation
 
-    named = {name: getattr(args, name) for name in ("steps_per_second", "inference_seconds")}
+    names = ("steps_per_second", "frames_per_second", "inference_seconds")
+    named = {name: getattr(args, name) for name in names}
     rates = AssumedRates(**{name: value for name, value in named.items() if value is not None})
     allowed = args.allow_environment_change
     print("\n".join(describe_evaluation(resolved, rates=rates, allow_environment_change=allowed)))

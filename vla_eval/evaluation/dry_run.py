@@ -26,9 +26,10 @@ GB = 1e9
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AssumedRates:
-    """What is assumed of one worker, images included, and of an inference of a learned policy."""
+    """What is assumed of one worker on a CPU (docs/speed.md), and of an inference of a learned policy."""
 
-    steps_per_second: float = 20.0
+    steps_per_second: float = 500.0  # without images; resets are in it
+    frames_per_second: float = 50.0  # images of one camera
     inference_seconds: float = 0.2
 
 
@@ -49,8 +50,8 @@ class EvaluationEffort:
 
     def seconds(self, rates: AssumedRates) -> float:
         """Return how long it takes at these rates, all workers busy to the end."""
-        busy = self.n_steps / rates.steps_per_second + self.n_learned_inferences * rates.inference_seconds
-        return busy / self.n_workers
+        simulated = self.n_steps / rates.steps_per_second + self.n_frames / rates.frames_per_second
+        return (simulated + self.n_learned_inferences * rates.inference_seconds) / self.n_workers
 
 
 def describe_evaluation(
@@ -125,9 +126,10 @@ def _lines(resolved: ResolvedEvaluation, effort: EvaluationEffort, rates: Assume
         yield f"note: {note}"
     yield f"time, estimated: {effort.seconds(rates) / 3600:.2g} h"
     yield (
-        f"assumptions: {rates.steps_per_second:g} control steps per second and worker, "
-        f"{rates.inference_seconds:g} s per inference of a learned policy, every worker busy to the end, no "
-        "episode ends early; starting and loading not counted. The run's progress bar shows the real rate"
+        f"assumptions: {rates.steps_per_second:g} control steps and {rates.frames_per_second:g} frames per "
+        f"second and worker, {rates.inference_seconds:g} s per inference of a learned policy, every worker "
+        "busy to the end, no episode ends early; starting and loading not counted. The run's progress bar "
+        "shows the real rate"
     )
 
 

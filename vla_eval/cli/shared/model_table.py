@@ -35,8 +35,17 @@ FINETUNE_FLAGS = (
     *("held_out_episodes", "overrides"),
 )
 EVAL_FLAGS = (
-    *("protocol", "suite", "steps_per_second", "inference_seconds", "n_action_steps", "episodes"),
-    *("seed_start", "runs", "overrides", "capture_video", "capture_rrd", "capture_strip"),
+    *("protocol", "suite", "steps_per_second", "frames_per_second", "inference_seconds"),
+    *(
+        "n_action_steps",
+        "episodes",
+        "seed_start",
+        "runs",
+        "overrides",
+        "capture_video",
+        "capture_rrd",
+        "capture_strip",
+    ),
     *("delay_trace", "serve"),
 )
 """Flags that a table does not take, by the names of their values; `--task` and `--policy` choose a part."""
