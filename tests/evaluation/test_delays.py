@@ -148,6 +148,18 @@ def test_it_is_said_where_a_delay_makes_motion_get_lost(
     assert all(mode in note for note in said)
 
 
+@pytest.mark.parametrize("mode", CONTROL_MODES)
+@pytest.mark.parametrize("chunking", [{}, {"mode": "temporal_ensemble"}, {"mode": "wait"}])
+def test_it_is_said_where_relative_actions_are_averaged(
+    bench: Bench, mode: str, chunking: dict[str, Any]
+) -> None:
+    env = {"control_mode": mode}
+    config = bench.config(policies=["oracle"], simulator="maniskill", env=env, chunking=chunking)
+    said = [note for note in make_plan(config).notes if "planned from different places" in note]
+    assert len(said) == (chunking.get("mode") == "temporal_ensemble" and "delta" in mode)
+    assert all(mode in note for note in said)
+
+
 def test_a_delay_that_is_a_number_is_recorded_as_before_it_could_vary(bench: Bench) -> None:
     """Else runs of earlier versions could not be continued."""
     old = bench.config(chunking={"delay_steps": 1})

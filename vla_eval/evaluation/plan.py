@@ -106,7 +106,8 @@ class Plan:
         replayed = [] if self.delays is None else [self.delays.note([job.key for job in self.jobs])]
         nothing_known = [about_nothing_known(part) for part in unknown]
         meshes = [] if self.about_meshes is None else [self.about_meshes]
-        return [*meshes, *nothing_known, *replayed, *self.about_measured, *self.about_skipped]
+        about_chunks = [*self.about_measured, *self.about_skipped, *self.about_averaged]
+        return [*meshes, *nothing_known, *replayed, *about_chunks]
 
     @property
     def about_measured(self) -> list[str]:
@@ -134,6 +135,19 @@ class Plan:
             "is motion that is lost: arms stop before the target. delay_alignment=stale executes it late; "
             "pd_joint_pos and pd_ee_pose have absolute targets (docs/real_time.md#relative-actions)."
             for mode in modes
+        ]
+
+    @property
+    def about_averaged(self) -> list[str]:
+        """A note where plans of relative actions are averaged."""
+        groups = [group for group in self._groups if group.rollout.chunking.execution.averages]
+        modes = dict.fromkeys(group.offered.action.control_mode for group in groups)
+        return [
+            f"chunking.mode=temporal_ensemble: actions of {mode} are relative, and those of a step are "
+            "planned from different places: their mean moves the arm too little, most of all where it sets "
+            "out (docs/real_time.md#relative-actions)."
+            for mode in modes
+            if mode in RELATIVE_MODES
         ]
 
     @property
