@@ -104,6 +104,7 @@ def test_where_a_light_casts_shadows_all_triangles_are_drawn() -> None:
     inner.scene.sub_scenes[0].render_system.lights[0].shadow = True
     view = CameraView("base_camera", {})
     view.submit(inner)
+    view.image()  # a scene that is freed while it is drawn crashes the process
     assert not view._culled
     env.close()
 

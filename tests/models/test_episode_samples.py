@@ -7,7 +7,8 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from torch import Tensor
 
-from vla_eval.errors import RecipeError
+from vla_eval.control_modes import CONTROL_MODES
+from vla_eval.errors import RecipeError, SpecMismatchError
 from vla_eval.features import ACTION_KEY, ACTION_PADDING_KEY, STATE_KEY
 from vla_eval.models.episodes.samples import AT_REST_M, Episodes, after_waiting, count_motions, episodes_of
 from vla_eval.models.sequence.configuration_sequence import MikasaSequenceConfig
@@ -290,6 +291,17 @@ class TestGoals:
                 for steps, counts in zip(episodes.steps, episodes.counts, strict=True)
             }
         assert ends == {2, 4, 7}
+
+
+@pytest.mark.parametrize("mode", CONTROL_MODES)
+def test_goals_of_motions_are_refused_for_actions_that_do_not_translate_the_tool(mode: str) -> None:
+    config().fit_to_control_mode(mode)
+    chosen = config(goal_of_each_motion=True)
+    if mode.startswith("pd_ee_delta"):
+        chosen.fit_to_control_mode(mode)
+        return
+    with pytest.raises(SpecMismatchError, match=rf"translate the tool.*{mode}.*goal_of_each_motion to false"):
+        chosen.fit_to_control_mode(mode)
 
 
 class TestWaitingOn:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 DATA_FOLDER = Path("data")
 FINGERPRINT_DIGITS = 8
 MEGABYTE = 1_000_000
-STEPS_PER_SECOND = 25  # a worker, software rendering; docs/datasets.md: 25.4 steps in 0.9 s
+STEPS_PER_SECOND = 25  # a worker, software rendering; docs/speed.md: 25.4 steps in 0.65 s, 39, alone
 BYTES_PER_STEP = 11_000  # docs/datasets.md: 70 MB of 6,200 frames
 DESCRIPTION = """Record demonstrations of a scripted expert as LeRobot datasets, one per task: OUT/TASK.
 

@@ -26,7 +26,7 @@ def check_python(_: Probe) -> Finding:
             status="warn",
             found=f"{found}, writes no compiled files",
             advice=f"Each command takes seconds longer. Unset PYTHONDONTWRITEBYTECODE, or compile once: "
-            f"{sys.executable} -m compileall -q {sys.prefix}/lib",
+            f"{sys.prefix}/bin/python -m compileall -q {sys.prefix}/lib",
         )
     return Finding(status="ok", found=found)
 

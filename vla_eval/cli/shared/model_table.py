@@ -36,17 +36,8 @@ FINETUNE_FLAGS = (
 )
 EVAL_FLAGS = (
     *("protocol", "suite", "steps_per_second", "frames_per_second", "inference_seconds"),
-    *(
-        "n_action_steps",
-        "episodes",
-        "seed_start",
-        "runs",
-        "overrides",
-        "capture_video",
-        "capture_rrd",
-        "capture_strip",
-    ),
-    *("delay_trace", "serve"),
+    *("n_action_steps", "episodes", "seed_start", "runs", "overrides", "delay_trace", "serve"),
+    *("capture_video", "capture_rrd", "capture_strip"),
 )
 """Flags that a table does not take, by the names of their values; `--task` and `--policy` choose a part."""
 

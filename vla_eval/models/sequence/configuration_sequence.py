@@ -39,7 +39,7 @@ class MikasaSequenceConfig(EpisodeConfig):
     # chunking.mode=prefix. Half of those given while the arm has only waited are of waiting on.
     prefix_steps: int = 0
     # the goal is where the motion under way ends, or the next one, not the demonstration; each motion begins
-    # with a decision. For tasks in which several things are touched in turn: `docs/capacity.md`.
+    # with a decision. For tasks in which several things are touched in turn: `docs/many_tasks.md`.
     goal_of_each_motion: bool = False
     tokens: str = "step"  # of a step, a name of `TOKENS`
     state_in_token: bool = True  # the token of an observation has the state in it, not only the images
