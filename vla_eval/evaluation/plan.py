@@ -14,6 +14,7 @@ from vla_eval.checkpoints.notes import (
     training_sentences,
 )
 from vla_eval.checkpoints.trained_with import Sentences, about_nothing_known, about_sentence
+from vla_eval.chunking import ChunkingSpec
 from vla_eval.config.environment import EnvSettings
 from vla_eval.config.evaluation import EvalConfig
 from vla_eval.config.files import Recipe, digest_of
@@ -123,13 +124,7 @@ class Plan:
     @property
     def about_skipped(self) -> list[str]:
         """A note where a delay makes motion get lost."""
-        modes = dict.fromkeys(
-            group.offered.action.control_mode
-            for group in self._groups
-            if group.rollout.chunking.delay != 0
-            and group.rollout.chunking.is_aligned
-            and group.offered.action.control_mode in RELATIVE_MODES
-        )
+        modes = self._relative_modes(lambda chunking: chunking.delay != 0 and chunking.is_aligned)
         return [
             f"chunking.delay with delay_alignment=skip: actions of {mode} are relative, and what is skipped "
             "is motion that is lost: arms stop before the target. delay_alignment=stale executes it late; "
@@ -140,15 +135,19 @@ class Plan:
     @property
     def about_averaged(self) -> list[str]:
         """A note where plans of relative actions are averaged."""
-        groups = [group for group in self._groups if group.rollout.chunking.execution.averages]
-        modes = dict.fromkeys(group.offered.action.control_mode for group in groups)
+        modes = self._relative_modes(lambda chunking: chunking.execution.averages)
         return [
             f"chunking.mode=temporal_ensemble: actions of {mode} are relative, and those of a step are "
             "planned from different places: their mean moves the arm too little, most of all where it sets "
             "out (docs/real_time.md#relative-actions)."
             for mode in modes
-            if mode in RELATIVE_MODES
         ]
+
+    def _relative_modes(self, chosen: Callable[[ChunkingSpec], bool]) -> list[str]:
+        """Return the control modes of relative actions that are executed in a chosen way."""
+        groups = (group for group in self._groups if chosen(group.rollout.chunking))
+        modes = dict.fromkeys(group.offered.action.control_mode for group in groups)
+        return [mode for mode in modes if mode in RELATIVE_MODES]
 
     @property
     def _groups(self) -> list[EpisodeGroup]:
