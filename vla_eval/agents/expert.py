@@ -23,7 +23,7 @@ from vla_eval.seeding import Stream, generator
 from vla_eval.tasks.catalog import task_spec
 
 EXPERT = "oracle"
-DEMONSTRATION, ORDER = 0, 1
+DEMONSTRATION, ORDER, EXCHANGE = 0, 1, 2
 """What is drawn for an imitation, apart from all that belongs to a checkpoint."""
 ENOUGH_TRIES = 4  # so many times the demonstrations asked for; an expert that needs more is none
 
@@ -161,3 +161,8 @@ def touched_next(results: Sequence[StepResult]) -> NDArray[np.int64]:
 def order(run_seed: int, pass_number: int, n: int) -> np.ndarray[Any, Any]:
     """Return in which order `n` demonstrations are read in a pass."""
     return generator(run_seed, Stream.AGENT, DEMONSTRATION, ORDER, pass_number).permutation(n)
+
+
+def exchanges(run_seed: int, step: int) -> np.random.Generator:
+    """Return what draws how candidates are exchanged at a gradient step."""
+    return generator(run_seed, Stream.AGENT, DEMONSTRATION, EXCHANGE, step)

@@ -16,8 +16,9 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from vla_eval.agents.expert import Demonstration, order
+from vla_eval.agents.expert import Demonstration, exchanges, order
 from vla_eval.agents.vector_env import SlotsEnv
+from vla_eval.policies.agents.imitator import exchanged
 from vla_eval.strict.bounds import require
 
 LOG_EVERY_STEPS = 20
@@ -64,6 +65,8 @@ class Imitation(BaseAlgorithm):
             own action is learned.
         meant_weight: of the cross-entropy of the candidate that the expert touched next, beside the squared
             errors of its actions: what an arm does once it moves tells where it goes, and needs no memory.
+        exchange_share: in so many of the demonstrations of a step, the candidates exchange what they are, as
+            drawn: more is to be remembered than the demonstrations show, and no order can be learned by heart.
         batch_size: demonstrations per step.
         weight_decay: of AdamW.
         max_grad_norm: longer gradients are cut to it.
@@ -79,6 +82,7 @@ class Imitation(BaseAlgorithm):
         demonstrations: int = 250,
         action_noise: float = 0.0,
         meant_weight: float = 0.02,
+        exchange_share: float = 0.0,
         batch_size: int = 32,
         weight_decay: float = 0.0,
         max_grad_norm: float = 1.0,
@@ -93,12 +97,13 @@ class Imitation(BaseAlgorithm):
         weights = {"action_noise": action_noise, "meant_weight": meant_weight, "weight_decay": weight_decay}
         for name, size in weights.items():
             require(0 <= size < math.inf, f"{ARGUMENTS}.{name}", size, "a number ≥ 0")
+        require(0 <= exchange_share <= 1, f"{ARGUMENTS}.exchange_share", exchange_share, "0 to 1")
         require(max_grad_norm > 0, f"{ARGUMENTS}.max_grad_norm", max_grad_norm, "a number above 0")
         assert env.expert is not None
         self._expert = env.expert
         self.batch_size, self.n_demonstrations = batch_size, demonstrations
         self.action_push, self._weight_decay, self._max_grad_norm = action_noise, weight_decay, max_grad_norm
-        self._meant_weight = meant_weight
+        self._meant_weight, self._exchange_share = meant_weight, exchange_share
         self._demonstrations: Demonstrations | None = None
         self._setup_model()
 
@@ -158,6 +163,9 @@ class Imitation(BaseAlgorithm):
             part[chosen, :longest].to(self.device)
             for part in (given.inputs, given.actions, given.meant, given.is_step)
         )
+        if self._exchange_share:
+            orders = torch.from_numpy(self._orders(len(chosen)))
+            inputs, meant = exchanged(inputs, meant, orders.to(self.device))
         answers, _ = self.policy(inputs, self.policy.core.begin(len(chosen)))
         errors = self.policy.errors(answers, actions, meant, meant_weight=self._meant_weight)
         loss = errors[is_step].mean()
@@ -167,6 +175,14 @@ class Imitation(BaseAlgorithm):
         self.optimizer.step()
         self._n_updates += 1
         return float(loss.detach())
+
+    def _orders(self, n: int) -> np.ndarray[Any, Any]:
+        """Return how the candidates of `n` demonstrations are exchanged at this step, (n, candidates)."""
+        n_places = self.policy.n_places
+        drawn = exchanges(self._expert.run_seed, self.num_timesteps)
+        as_they_are = np.tile(np.arange(n_places), (n, 1))
+        is_exchanged = drawn.random(n) < self._exchange_share
+        return np.where(is_exchanged[:, None], drawn.permuted(as_they_are, axis=1), as_they_are)
 
     def _chosen(self, n: int) -> np.ndarray[Any, Any]:
         """Return the demonstrations of this step: none is read twice in a pass."""

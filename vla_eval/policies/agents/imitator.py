@@ -72,6 +72,26 @@ def as_inputs(seen: Seen) -> FloatArray:
     return inputs
 
 
+def exchanged(inputs: Tensor, meant: Tensor, orders: Tensor) -> tuple[Tensor, Tensor]:
+    """Let the candidates of demonstrations exchange what they are, alike at all steps.
+
+    Which was shown, where each lies and which is meant are exchanged together: what candidate k was is now
+    the candidate whose number in its row of `orders` is k.
+
+    Args:
+        inputs: (B, T, inputs) of the observation `vector`.
+        meant: (B, T); -1 stays.
+        orders: (B, n) a permutation of the candidates in each row.
+    """
+    n_steps, n = inputs.shape[1], orders.shape[1]
+    before, shown, due, places = inputs.split([inputs.shape[-1] - 4 * n - 1, n, 1, 3 * n], dim=-1)
+    at_each = orders[:, None].expand(-1, n_steps, -1)
+    shown = shown.gather(-1, at_each)
+    places = places.unflatten(-1, (n, 3)).gather(-2, at_each[..., None].expand(-1, -1, -1, 3)).flatten(-2)
+    renamed = orders.argsort(dim=1).gather(1, meant.clamp(min=0))
+    return torch.cat([before, shown, due, places], dim=-1), torch.where(meant < 0, meant, renamed)
+
+
 class Answers(NamedTuple):
     """What the network says at each step."""
 
