@@ -1,5 +1,6 @@
 """An imitation learns what its expert did in episodes that were like the agent's, with any core."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ import torch
 
 pytest.importorskip("stable_baselines3", reason="needs `make rl`")
 
+from tests.agents.test_observing import robot_reader, seen
 from tests.agents.tiny_agents import BIT, ROBOT, tiny, trained
 from vla_eval.agents.expert import Demonstration, Expert, touched_next
 from vla_eval.agents.imitation import Demonstrations
@@ -20,10 +22,10 @@ from vla_eval.config.files import load_recipe
 from vla_eval.core import Observation, StepResult
 from vla_eval.errors import RecipeError, TrainingError, VlaEvalError
 from vla_eval.models.cores.sizes import CORES
-from vla_eval.policies.agents.imitator import CoreNetwork
+from vla_eval.policies.agents.imitator import CoreNetwork, as_inputs, exchanged
 from vla_eval.policies.agents.observing import PLACES, VECTOR, action_space, given_space
 from vla_eval.storage.run_folder import read_run
-from vla_eval.task_state import TaskStatus
+from vla_eval.task_state import PrivilegedState, TaskStatus
 
 pytestmark = pytest.mark.usefixtures("in_this_process", "light_workers")
 SIZES = {"width": 16, "layers": 2, "heads": 2, "context_steps": 4}
@@ -109,6 +111,29 @@ def test_what_is_meant_is_what_is_touched_next_while_candidates_are_in_view() ->
     assert touched_next(results).tolist() == [-1, 2, 2, 0, 0, -1]
 
 
+def test_candidates_that_exchange_are_seen_as_if_the_world_were_so() -> None:
+    """The cue, then all three in view: once as they are, once exchanged by hand."""
+    order = np.array([2, 0, 1])  # what was candidate 2 is now candidate 0, and so on
+    read = robot_reader("vector").read
+    inputs = []
+    for is_exchanged in (False, True):
+        rng = np.random.default_rng(7)
+        cue = seen(rng, phase="cue", right=(2,), shown=(2,))
+        choice = seen(rng, phase="response", right=(2,), shown=())
+        if is_exchanged:
+            assert isinstance(cue.privileged, PrivilegedState)
+            assert isinstance(choice.privileged, PrivilegedState)
+            cue = replace(cue, privileged=replace(cue.privileged, shown_candidates=(0,)))
+            places = choice.privileged.candidate_positions_m[order]
+            choice = replace(choice, privileged=replace(choice.privileged, candidate_positions_m=places))
+        inputs.append(np.stack([as_inputs(read(one)) for one in (cue, choice)]))
+    found, meant = exchanged(
+        torch.from_numpy(inputs[0])[None], torch.tensor([[-1, 2]]), torch.from_numpy(order)[None]
+    )
+    np.testing.assert_array_equal(found[0].numpy(), inputs[1])
+    assert meant.tolist() == [[-1, 0]]
+
+
 def test_a_step_without_a_candidate_that_is_meant_costs_nothing(tmp_path: Path) -> None:
     made = network("gru", ROBOT, tmp_path)
     inputs = torch.zeros(1, 2, 5 + 3 * made.n_places)
@@ -149,6 +174,13 @@ def test_a_step_without_a_candidate_that_is_meant_costs_nothing(tmp_path: Path) 
             {"network": {"core": "gru", "core_options": {"keep_bas": 1}}},
             VlaEvalError,
             "train_agent.network.core_options .*Did you mean 'keep_bias'",
+        ),
+        (BIT, {"arguments": {"exchange_share": 0.5}}, RecipeError, "exchange_share is 0.5: .* no candidates"),
+        (
+            ROBOT,
+            {"arguments": {"exchange_share": 1.5}},
+            RecipeError,
+            "exchange_share is 1.5, expected 0 to 1",
         ),
         (BIT, {"network": {"net_arch": [8]}}, VlaEvalError, "net_arch"),
         (BIT, {"network": {"width": 0}}, VlaEvalError, "width"),

@@ -49,8 +49,10 @@ TINY: dict[str, dict[str, Any]] = {
 def tiny(algorithm: str, out: Path, task: str = ROBOT, **changes: Any) -> AgentConfig:
     """Return a training of an algorithm, of a robot task in the fake simulator."""
     fields = {"env": {}, **TINY[algorithm], **changes.pop("train_agent", {})}
-    fields["simulator"] = "maniskill" if task.startswith("mikasa_base") else "fake"
     is_base = task.startswith("mikasa_base")
+    fields["simulator"] = "maniskill" if is_base else "fake"
+    if algorithm == "imitation" and not is_base:  # so that what is exchanged is resumed, too
+        fields["arguments"] = {"exchange_share": 0.5, **fields["arguments"]}
     settings: dict[str, Any] = {
         "policy": f"{algorithm}_base" if is_base else algorithm,
         "task": task,

@@ -66,7 +66,7 @@ class Imitation(BaseAlgorithm):
         meant_weight: of the cross-entropy of the candidate that the expert touched next, beside the squared
             errors of its actions: what an arm does once it moves tells where it goes, and needs no memory.
         exchange_share: in so many of the demonstrations of a step, the candidates exchange what they are, as
-            drawn: more is to be remembered than the demonstrations show, and no order can be learned by heart.
+            drawn, so that what is shown cannot be learned by heart.
         batch_size: demonstrations per step.
         weight_decay: of AdamW.
         max_grad_norm: longer gradients are cut to it.

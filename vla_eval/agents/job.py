@@ -115,7 +115,7 @@ def agent_job(config: AgentConfig) -> AgentJob:
 def _check_imitation(recipe: AgentRecipe, reader: Reader, *, is_base: bool) -> None:
     """Refuse what no imitation can do."""
     decode(CoreSizes, recipe.network, where=NETWORK)
-    noise = recipe.arguments.get("action_noise", 0)
+    noise, exchanged = (recipe.arguments.get(name, 0) for name in ("action_noise", "exchange_share"))
     if reader.cameras:
         raise RecipeError(
             "algorithm 'imitation' reads numbers, and is given images. Robot tasks have --observation "
@@ -126,6 +126,11 @@ def _check_imitation(recipe: AgentRecipe, reader: Reader, *, is_base: bool) -> N
         raise RecipeError(
             f"train_agent.arguments.action_noise is {noise:g}: tasks of MIKASA-Base have no arm to push. "
             "Leave it out."
+        )
+    if is_base and exchanged > 0:
+        raise RecipeError(
+            f"train_agent.arguments.exchange_share is {exchanged:g}: tasks of MIKASA-Base have no candidates "
+            "that could be exchanged. Leave it out."
         )
     if recipe.reward != "dense":
         raise RecipeError(f"--reward {recipe.reward}: an imitation learns from no reward. Leave it out.")
