@@ -84,10 +84,12 @@ def exchanged(inputs: Tensor, meant: Tensor, orders: Tensor) -> tuple[Tensor, Te
         orders: (B, n) a permutation of the candidates in each row.
     """
     n_steps, n = inputs.shape[1], orders.shape[1]
-    before, shown, due, places = inputs.split([inputs.shape[-1] - 4 * n - 1, n, 1, 3 * n], dim=-1)
+    sizes = [inputs.shape[-1] - 4 * n - 1, n, 1, 3 * n]
+    before, shown, due, places = torch.split(inputs, sizes, dim=-1)
     at_each = orders[:, None].expand(-1, n_steps, -1)
     shown = shown.gather(-1, at_each)
-    places = places.unflatten(-1, (n, 3)).gather(-2, at_each[..., None].expand(-1, -1, -1, 3)).flatten(-2)
+    places = places.reshape(*shown.shape, 3)
+    places = places.gather(-2, at_each[..., None].expand(-1, -1, -1, 3)).flatten(-2)
     renamed = orders.argsort(dim=1).gather(1, meant.clamp(min=0))
     return torch.cat([before, shown, due, places], dim=-1), torch.where(meant < 0, meant, renamed)
 
