@@ -1,10 +1,13 @@
 """Draw whether a memory core's rank on diagnostic tasks is that on robot tasks, and print tables of both.
 
-python scripts/ladder_image.py ladder.png runs/ladder_base/evaluation runs/ladder_robots/evaluation
+python scripts/ladder_image.py docs/images/ladder.png runs/ladder_base/evaluation runs/ladder_robots/evaluation
 
 A score is the part of the way from the best player without memory (0) to the oracle (1), on the same seeds.
+Scores are kept beside the image, as ladder.csv: what is given replaces what is kept of its tasks, so that a
+task can be added without the others being trained again.
 """
 
+import csv
 import sys
 from collections import defaultdict
 from pathlib import Path
@@ -32,9 +35,12 @@ Scores = dict[str, dict[str, float]]  # core -> task -> score
 
 
 def main() -> None:
-    """Read the two evaluations, print, draw."""
+    """Read the evaluations, keep, print, draw."""
     target, *folders = sys.argv[1:]
-    ends = dict(zip(ENDS, (scores_of(Path(folder)) for folder in folders), strict=True))
+    kept = Path(target).with_suffix(".csv")
+    scores = updated(read_scores(kept), [scores_of(Path(folder)) for folder in folders])
+    write_scores(kept, scores)
+    ends = {end: part_of(scores, is_base=end == ENDS[0]) for end in ENDS}
     for scores in ends.values():
         print(table(scores), "\n")
     print("| memory | cores | diagnostic tasks | robot tasks | rank correlation | p |")
@@ -54,6 +60,47 @@ def main() -> None:
     panels[0].set(ylabel="score on robot tasks")
     figure.legend(loc="outside right center")
     figure.savefig(target, dpi=DPI)
+
+
+def read_scores(kept: Path) -> Scores:
+    """Return the scores of a CSV file; none without one."""
+    scores: Scores = defaultdict(dict)
+    if kept.exists():
+        for row in csv.DictReader(kept.read_text().splitlines()):
+            scores[row["core"]][row["task"]] = float(row["score"])
+    return scores
+
+
+def write_scores(kept: Path, scores: Scores) -> None:
+    """Write them, sorted."""
+    rows = sorted((task, core, score) for core, tasks in scores.items() for task, score in tasks.items())
+    lines = ["core,task,score", *(f"{core},{task},{score:.3f}" for task, core, score in rows)]
+    kept.write_text("\n".join(lines) + "\n")
+
+
+def updated(kept: Scores, found: list[Scores]) -> Scores:
+    """Return the kept scores, with what was found in the place of all that is kept of its tasks."""
+    new = {task for scores in found for tasks in scores.values() for task in tasks}
+    scores: Scores = defaultdict(dict)
+    for core, tasks in kept.items():
+        scores[core] = {task: score for task, score in tasks.items() if task not in new}
+    for one in found:
+        for core, tasks in one.items():
+            scores[core] |= tasks
+    return scores
+
+
+def part_of(scores: Scores, *, is_base: bool) -> Scores:
+    """Return the scores at one end. Every core needs one on every task, else there is no rank."""
+    end = {
+        core: {task: score for task, score in tasks.items() if task_spec(task).is_base == is_base}
+        for core, tasks in scores.items()
+    }
+    all_tasks = {task for tasks in end.values() for task in tasks}
+    for core, tasks in end.items():
+        if missing := sorted(all_tasks - set(tasks)):
+            raise SystemExit(f"{core} has no score on {', '.join(missing)}: train and evaluate it there.")
+    return end
 
 
 def scores_of(folder: Path) -> Scores:
