@@ -20,6 +20,9 @@ CUE_IN_STATE = frozenset({"vla_eval.tasks.rotate:RotateEnv"})
 
 ChangeOf = Literal["choice", "set", "angle", "actions"]
 
+Answer = tuple[int, ...] | frozenset[int]
+"""Candidates: in their order, where it counts."""
+
 ANGLE_TOLERANCE_RAD = 0.1
 """Of Rotate's success rule: angles nearer to each other are one answer. Those of a swap are twice as far
 apart, or more."""
@@ -61,6 +64,23 @@ def follows(record: EpisodeRecord) -> bool:
     if record.target is None:
         return bool(record.success_once)
     return bool(record.first_choice_success)
+
+
+def right_answer(record: EpisodeRecord, spec: TaskSpec) -> Answer | None:
+    """Return what is right in an episode; None where there are no candidates, or the record is too old."""
+    right = record.right_candidates if record.target is None else (record.target,)
+    return _as_answer(right, spec) if right else None
+
+
+def given_answer(record: EpisodeRecord, spec: TaskSpec) -> Answer:
+    """Return the first candidates that were chosen, as many as are right, or fewer."""
+    if record.target is not None:
+        return _as_answer(() if record.first_choice is None else (record.first_choice,), spec)
+    return _as_answer((record.touched_candidates or ())[: len(record.right_candidates or ())], spec)
+
+
+def _as_answer(candidates: Sequence[int], spec: TaskSpec) -> Answer:
+    return tuple(candidates) if spec.memory == "sequential" else frozenset(candidates)
 
 
 def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | None:

@@ -10,7 +10,16 @@ from vla_eval.probe.decoding import Decoded, decoded_memories
 from vla_eval.probe.interventions import INTERVENTIONS
 from vla_eval.probe.mistakes import Capacity, Mistakes, capacity, mistakes
 from vla_eval.probe.phases import Inferences, Phases, inferences, n_cue_frames_after, phases_of
-from vla_eval.probe.quantities import Pair, SwapQuantities, follows, pair_up, paired_p, swap_quantities
+from vla_eval.probe.quantities import (
+    Pair,
+    SwapQuantities,
+    follows,
+    given_answer,
+    pair_up,
+    paired_p,
+    right_answer,
+    swap_quantities,
+)
 from vla_eval.probe.retention import Contrast, Followed, Range, contrast, share_left
 from vla_eval.probe.retention_curves import Retention, retention_curves
 from vla_eval.probe.world_records import (
@@ -19,7 +28,7 @@ from vla_eval.probe.world_records import (
     by_policy,
     chance_of,
     compared_with,
-    donor_targets,
+    donor_answers,
     results_of,
 )
 from vla_eval.probe.worlds import (
@@ -161,15 +170,18 @@ def _row(world: World, found: Records, worlds: Worlds, policy: str, k: int) -> P
     own = found.get((policy, k), ())
     results = results_of(own)
     pairs = pair_up(compared_with(world, worlds).get((policy, k), ()), own)
-    targets = donor_targets(world, worlds, (policy, k))
+    spec = task_spec(world.task)
+    put_in = donor_answers(world, worlds, (policy, k))
     told_apart = [
-        record for record in results if targets.get((record.run, record.seed)) not in (None, record.target)
+        record
+        for record in results
+        if put_in.get((record.run, record.seed)) not in (None, right_answer(record, spec))
     ]
     choosing = [record for record in results if record.n_candidates]
     is_swap = world.intervention in SWAPS
-    swap = swap_quantities(pairs, task_spec(world.task)) if is_swap else None
+    swap = swap_quantities(pairs, spec) if is_swap else None
     compared = not is_swap and world.intervention != AS_DRAWN
-    phases = phases_of(task_spec(world.task), world.config.env)
+    phases = phases_of(spec, world.config.env)
     p_value = swap.p_value if swap is not None else paired_p(pairs) if compared else None
     return ProbeRow(
         task=world.task,
@@ -185,11 +197,11 @@ def _row(world: World, found: Records, worlds: Worlds, policy: str, k: int) -> P
         n_without_choice=sum(record.first_choice is None for record in choosing) if choosing else None,
         success=Share.counted(results, lambda record: bool(record.success_once)),
         chance=chance_of(results, found, k),
-        mistakes=mistakes(results, task_spec(world.task)),
+        mistakes=mistakes(results, spec),
         kept=capacity(results),
         over_delay=None,
         followed_memory=Share.counted(
-            told_apart, lambda record: record.first_choice == targets[record.run, record.seed]
+            told_apart, lambda record: given_answer(record, spec) == put_in[record.run, record.seed]
         ),
         n_cue_frames_after=(
             n_cue_frames_after(phases, k)

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 
-from vla_eval.probe.quantities import follows
+from vla_eval.probe.quantities import Answer, follows, right_answer
 from vla_eval.probe.worlds import AS_DRAWN, World
 from vla_eval.records import EpisodeRecord
 from vla_eval.results.comparison import CHANCE_POLICY
+from vla_eval.tasks.catalog import task_spec
 
 Records = Mapping[tuple[str, int], Sequence[EpisodeRecord]]
 """(policy, n_action_steps) -> records of one world."""
@@ -29,7 +30,7 @@ def compared_with(world: World, worlds: Worlds) -> Records:
     return next(own, {})
 
 
-def donor_targets(world: World, worlds: Worlds, key: tuple[str, int]) -> dict[tuple[int, int], int | None]:
+def donor_answers(world: World, worlds: Worlds, key: tuple[str, int]) -> dict[tuple[int, int], Answer | None]:
     """Return (run, seed) -> what the memory that is put into this episode makes right, of a policy and K."""
     if world.intervention == "transplant":
         donors, later = ("swap", world.level), 0
@@ -38,7 +39,9 @@ def donor_targets(world: World, worlds: Worlds, key: tuple[str, int]) -> dict[tu
     else:
         return {}
     own = (found for other, found in worlds if (other.intervention, other.level) == donors)
-    return {(one.run, one.seed + later): one.target for one in results_of(next(own, {}).get(key, ()))}
+    spec = task_spec(world.task)
+    records = results_of(next(own, {}).get(key, ()))
+    return {(one.run, one.seed + later): right_answer(one, spec) for one in records}
 
 
 def results_of(records: Iterable[EpisodeRecord]) -> list[EpisodeRecord]:
