@@ -1,6 +1,6 @@
 """Draw whether a memory core's rank on diagnostic tasks is that on robot tasks, and print tables of both.
 
-python scripts/ladder_image.py docs/images/ladder.png runs/ladder_base/evaluation runs/ladder_robots/evaluation …
+python scripts/ladder_image.py docs/images/ladder.png runs/ladder_base/evaluation …
 
 A score is the part of the way from the best player without memory (0) to the oracle (1), on the same seeds.
 Scores are kept beside the image, as ladder.csv: what is given replaces what is kept of its tasks, so that a
