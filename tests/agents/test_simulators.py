@@ -2,20 +2,24 @@
 
 import os
 import signal
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 pytest.importorskip("stable_baselines3", reason="needs `make rl`")
 
 from tests.agents.test_resuming import files_of
-from tests.agents.tiny_agents import ROBOT, tiny, trained
+from tests.agents.tiny_agents import ROBOT, StopAfter, tiny, trained
 from vla_eval.agents.simulators import Simulators, simulators
+from vla_eval.agents.train import train_agent
+from vla_eval.config.agents import AgentConfig
 from vla_eval.config.environment import EnvSettings
 from vla_eval.envs.factory import make_env
-from vla_eval.errors import SimulationError
+from vla_eval.errors import MissingDependencyError, SimulationError
 
 pytestmark = pytest.mark.usefixtures("light_workers")
 
@@ -68,6 +72,36 @@ def test_no_more_processes_than_slots_and_none_for_arrays_alone(tmp_path: Path) 
     several = simulators(settings(3), workers=8, is_robot=True, logs=tmp_path)
     assert not isinstance(alone, Simulators) and isinstance(several, Simulators)
     assert len(several._processes) == 3
+
+
+def on_gpu(out: Path) -> AgentConfig:
+    asked = tiny("ppo", out)
+    with_physics = {"sim_backend": "gpu", "simulator": "maniskill"}
+    return replace(asked, train_agent={**asked.train_agent, **with_physics})
+
+
+def test_on_a_gpu_one_process_holds_all_slots(tmp_path: Path) -> None:
+    asked = EnvSettings(task=ROBOT, sim_backend="gpu", n_slots=8)
+    for workers in ("auto", 4):
+        found = simulators(asked, workers=workers, is_robot=True, logs=tmp_path)  # type: ignore[arg-type]
+        assert isinstance(found, Simulators) and len(found._processes) == 1
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="a GPU is here")
+def test_without_a_gpu_its_simulator_is_refused_before_there_is_a_folder(tmp_path: Path) -> None:
+    physics = on_gpu(tmp_path / "run")
+    with pytest.raises(
+        MissingDependencyError, match=r"train_agent.sim_backend is 'gpu', but there are no GPUs"
+    ):
+        train_agent(physics)
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.gpu
+def test_on_a_gpu_an_agent_is_trained_and_resumed(tmp_path: Path) -> None:
+    physics = on_gpu(tmp_path / "run")
+    assert not train_agent(physics, is_stopping=StopAfter(11)).is_finished
+    assert train_agent(physics).is_finished
 
 
 def test_a_process_that_ends_is_one_message_with_its_log(spread: Simulators) -> None:

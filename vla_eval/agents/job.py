@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+
 from vla_eval.agents.request import in_whole_updates, load_agent_recipe, rounded_up, run_folder_of
 from vla_eval.base_tasks.named import DISCRETE
 from vla_eval.config.agents import TRAINING_SEEDS, AgentConfig, AgentRecipe
@@ -26,6 +28,7 @@ from vla_eval.policies.agents.observing import Reader, reader_of
 from vla_eval.policies.lerobot.device import choose_device
 from vla_eval.specs import EnvSpec
 from vla_eval.strict.decoding import decode
+from vla_eval.strict.devices import refuse_missing_gpu
 from vla_eval.tasks.arguments import pinned
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.objects.mesh_folder import without_path
@@ -79,8 +82,11 @@ def agent_job(config: AgentConfig) -> AgentJob:
         task=task.id,
         kwargs=_without_arm(arguments) if task.is_base else arguments,
         simulator=recipe.simulator,
+        sim_backend=recipe.sim_backend,
         n_slots=recipe.n_envs,
     )
+    if settings.simulator != "fake":
+        refuse_missing_gpu(torch.cuda.device_count(), {"train_agent.sim_backend": settings.sim_backend})
     env = describe_env(settings)
     if not row.fits_discrete and env.action.control_mode == DISCRETE:
         raise RecipeError(

@@ -203,6 +203,8 @@ def simulators(
     """
     has_physics = is_robot and settings.simulator != "fake"
     wanted = (available_cores() if has_physics else 1) if workers == "auto" else workers
+    if settings.sim_backend == "gpu":  # one environment holds all slots
+        wanted = 1
     n_processes = min(wanted, settings.n_slots)
     if n_processes == 1 and not has_physics:
         return make_env(settings)

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
-from vla_eval.config.environment import Simulator
+from vla_eval.config.environment import SimBackend, Simulator
 from vla_eval.config.files import check_run_name, recipe_fields
 from vla_eval.config.finetuning import HeldOutConfig, merge_fields
 from vla_eval.errors import RecipeError
@@ -36,6 +36,7 @@ class AgentRecipe:
     anneal_lr: bool = False  # the learning rate falls to zero by the last step
     tensorboard: bool = False
     simulator: Simulator = "maniskill"
+    sim_backend: SimBackend = "cpu"  # `gpu`: all environments of a robot are one, in one process
 
     def __post_init__(self) -> None:
         check_bounds(self, prefix="train_agent.")
