@@ -228,3 +228,29 @@ def test_in_a_share_of_the_episodes_colours_change_places_in_all_frames_also_aft
 def test_a_wrong_share_is_one_message(fields: dict[str, float], message: str) -> None:
     with pytest.raises(RecipeError, match=message):
         config(**fields)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_side_that_a_moving_arm_sees_changes_with_its_thing_and_what_is_none_stays(seed: int) -> None:
+    """Sides have 0.8 or 0.65 of the colour: one of red is nearly as dark as the top of maroon."""
+    images, empty = episode()
+    torch.manual_seed(seed)
+    sides = {2: (RED, 0.8), 10: (RED, 0.65), 18: (MAROON, 0.8), 26: (CYAN, 0.65)}
+    moving = wood(5)
+    for place, (color, share) in sides.items():
+        red, green, blue = (round(share * level) for level in color)
+        moving = with_square(moving, (red, green, blue), place)
+    moving = with_square(moving, MAROON, 34)
+    moving = with_square(moving, (112, 112, 120), 10, y=2)  # of the gripper
+    found = changed_things(
+        torch.cat([images, moving[None, None]]), empty, n_before=2, erases=False, exchanges=True
+    )
+    new = {
+        color: np.array(color_at(found[2, 0], 2 + 10 * place))
+        for place, color in enumerate((MAROON, RED, CYAN, BLUE))
+    }
+    assert {tuple(color) for color in new.values()} == {MAROON, RED, CYAN, BLUE}  # they have exchanged
+    for place, (color, share) in sides.items():
+        np.testing.assert_allclose(color_at(found[3, 0], place), share * new[color], atol=2)
+    np.testing.assert_allclose(color_at(found[3, 0], 34), new[MAROON], atol=2)
+    assert color_at(found[3, 0], 10, 2) == (112, 112, 120)

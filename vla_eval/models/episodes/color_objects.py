@@ -25,6 +25,10 @@ LEAST_PX = 8  # a smaller piece is noise of the video
 SAME_COLOR = 45.0  # distance in levels; red and maroon, cyan and teal, yellow and orange differ by more
 HUE_EDGES = (0.35, 0.87)  # of a channel relative to the strongest: orange's green is between, yellow's above
 IN_ITS_PLANE = ndimage.generate_binary_structure(2, 1)[None] & np.array([False, True, False])[:, None, None]
+# What a cube's faces have of the colour of its top, which is what an arm at rest sees of it
+# (docs/capacity.md).
+FACES = (1.0, 0.8, 0.65)
+SAME_FACE = 25.0  # distance in levels; the top of maroon and a side of red differ by 16, and are parted
 BRIGHT_SHARE = 0.3  # of a thing's pixels: its side towards the light, whose colour is compared
 MOST_SEEN = 2**15  # images: both cameras of 500 episodes of 32 steps, at most 200 MB of things
 
@@ -164,6 +168,17 @@ def groups_of(things: Sequence[Thing]) -> tuple[list[int], NDArray[np.float64]]:
     return groups, np.array(colors).reshape(-1, 3)
 
 
+def face_of(thing: Thing, colors: NDArray[np.float64]) -> tuple[int, float] | None:
+    """Return the group of `colors` (groups, 3) that a thing shows a face of, and which share of the colour.
+
+    None: it is none of them.
+    """
+    faces = colors[:, None] * np.array(FACES)[:, None]
+    away = np.linalg.norm(faces - thing.color, axis=-1)
+    group, face = divmod(int(away.argmin()), len(FACES))
+    return (group, FACES[face]) if away[group, face] <= SAME_FACE else None
+
+
 def changed_things(
     images: Tensor, empty: Tensor, *, n_before: int, erases: bool, exchanges: bool, may_stay: float = 1.0
 ) -> Tensor:
@@ -177,7 +192,9 @@ def changed_things(
         n_before: how many of the frames are before it.
         erases: of the colours that appear only at the decision, a random number is replaced by `empty`; one
             always stays. Only if the decision is the last frame: later, the arm has moved its camera.
-        exchanges: all colours of things change places, alike in all frames; shades are kept.
+        exchanges: all colours of things change places, alike in all frames; shades are kept. A moving arm
+            sees sides of things, which are darker: they change with the thing whose faces they are. What is
+            no face of a thing that was seen up to the decision stays as it is.
         may_stay: where things are erased, at most so large a share of the others stays.
     """
     before, after = images.cpu().numpy(), images.cpu().numpy().copy()
@@ -189,21 +206,27 @@ def changed_things(
         for camera, seen in enumerate(nothing)
         for thing in _SEEN.things_in(before[frame, camera], seen)
     ]
-    groups, colors = groups_of([thing for _, _, thing in found])
-    shown = {group for group, (frame, _, _) in zip(groups, found, strict=True) if frame < n_before}
-    choices = {group for group, (frame, _, _) in zip(groups, found, strict=True) if frame >= n_before}
+    at_rest = [one for one in found if one[0] <= n_before]
+    groups, colors = groups_of([thing for _, _, thing in at_rest])
+    shown = {group for group, (frame, _, _) in zip(groups, at_rest, strict=True) if frame < n_before}
+    choices = {group for group, (frame, _, _) in zip(groups, at_rest, strict=True) if frame == n_before}
     if not shown & choices:
         return images
     erased = _drawn(sorted(choices - shown), may_stay) if erases and n_frames == n_before + 1 else frozenset()
     others = colors[torch.randperm(len(colors)).numpy()] if exchanges else colors
-    for (frame, camera, thing), group in zip(found, groups, strict=True):
+    faces: list[tuple[int, float] | None] = [(group, 1.0) for group in groups]
+    faces += [face_of(thing, colors) if exchanges else None for _, _, thing in found[len(at_rest) :]]
+    for (frame, camera, thing), face in zip(found, faces, strict=True):
+        if face is None:
+            continue
+        group, share = face
         part = (slice(None), *thing.box)
         place, mask = after[frame, camera][part], thing.mask
         if group in erased:
             mask = _widened(mask)
             place[:, mask] = nothing[camera].image[part][:, mask]
         elif exchanges:
-            shade = before[frame, camera][part][:, mask].max(axis=0) / thing.color.max()
+            shade = share * before[frame, camera][part][:, mask].max(axis=0) / thing.color.max()
             place[:, mask] = (others[group][:, None] * shade).round().clip(0, MAX_LEVEL)
     return torch.from_numpy(after).to(images.device)
 
