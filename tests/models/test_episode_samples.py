@@ -292,6 +292,27 @@ class TestGoals:
             }
         assert ends == {2, 4, 7}
 
+    def test_steps_of_motion_can_be_left_out_and_decisions_stay(self) -> None:
+        """Of moving first, too: the first step of an episode is no motion."""
+        sizes = (1, 0.6, 0, 0, 1, 0.6, 1.2, 0.4)  # moves, waits, sets out at 4 and 6
+        given = self.given(sizes, n_real=8)
+        kept = {
+            share: {
+                tuple(dict.fromkeys(steps[counts[:, 0] > 0].tolist()))
+                for _ in range(20)
+                for episodes in [
+                    episodes_of(
+                        given, config(window_steps=8, moving_share=share), training=True, each_motion=True
+                    )
+                ]
+                for steps, counts in zip(episodes.steps, episodes.counts, strict=True)
+            }
+            for share in (1e-9, 0.5, 1.0)
+        }
+        assert kept[1.0] == {tuple(range(8))}
+        assert kept[1e-9] == {(0, 3, 4, 6, 7)}  # 3 waits; the last one is the frame that was sampled
+        assert len(kept[0.5]) > 2 and all({0, 3, 4, 6, 7} <= {*steps} for steps in kept[0.5])
+
 
 @pytest.mark.parametrize("mode", CONTROL_MODES)
 def test_goals_of_motions_are_refused_for_actions_that_do_not_translate_the_tool(mode: str) -> None:

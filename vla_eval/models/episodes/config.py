@@ -57,6 +57,9 @@ class EpisodeConfig(PortedConfig):
     change_weight: float = 3.0
     # a step whose action is that of the step before is used with this probability
     waiting_share: float = 0.3
+    # any other step that is not a decision, with this one: for a training of choices, most of whose frames
+    # would be of motions between them. The first step is always used.
+    moving_share: float = 1.0
     # share of the episodes of a training batch that end at a decision, one of the episode's at random: a
     # step at which the arm begins to move after it waited
     decision_share: float = 0.0
@@ -96,7 +99,7 @@ class EpisodeConfig(PortedConfig):
         super().__post_init__()
         self.check_choice("sentence", SENTENCES)
         check_bounds(self, BOUNDS)
-        for name in ("first_action_weight", "waiting_share"):
+        for name in ("first_action_weight", "waiting_share", "moving_share"):
             require(0 < getattr(self, name) <= 1, name, getattr(self, name), "a number in (0, 1]")
         for name, needed in NEEDS.items():
             met = bool(getattr(self, needed)) or not getattr(self, name)

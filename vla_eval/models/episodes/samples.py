@@ -212,6 +212,11 @@ def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
 def _kept(waits: Tensor, begins: Tensor, real: Tensor, config: EpisodeConfig) -> Tensor:
     """Return (B, T): the steps that are trained on, drawn by torch's generator."""
     left_out = waits & (torch.rand(waits.shape, device=waits.device) > config.waiting_share)
+    if config.moving_share < 1:
+        begun = torch.zeros_like(real)
+        begun[:, 1:] = real[:, :-1]  # all steps but the first one
+        moves = begun & ~waits & ~begins
+        left_out |= moves & (torch.rand(waits.shape, device=waits.device) > config.moving_share)
     left_out[:, -1] = False  # the frame that was sampled
     kept = real & ~left_out
     return kept & _until_a_decision(begins, config.decision_share) if config.decision_share else kept
