@@ -26,7 +26,7 @@ SAME_COLOR = 45.0  # distance in levels; red and maroon, cyan and teal, yellow a
 HUE_EDGES = (0.35, 0.87)  # of a channel relative to the strongest: orange's green is between, yellow's above
 IN_ITS_PLANE = ndimage.generate_binary_structure(2, 1)[None] & np.array([False, True, False])[:, None, None]
 # What a cube's faces have of the colour of its top, which is what an arm at rest sees of it
-# (docs/capacity.md).
+# (docs/general_memory.md).
 FACES = (1.0, 0.8, 0.65)
 SAME_FACE = 25.0  # distance in levels; the top of maroon and a side of red differ by 16, and are parted
 BRIGHT_SHARE = 0.3  # of a thing's pixels: its side towards the light, whose colour is compared
