@@ -9,10 +9,11 @@ pytest.importorskip("stable_baselines3", reason="needs `make rl`")
 from tests.agents.tiny_agents import BIT, ROBOT
 from vla_eval.agents.several import evaluation, in_folders, of_shard
 from vla_eval.cli.main import main
-from vla_eval.config.agents import AgentConfig
-from vla_eval.errors import RecipeError
+from vla_eval.config.agents import AgentConfig, AgentTable
+from vla_eval.errors import RecipeError, UnknownNameError
 from vla_eval.storage.run_folder import read_run
 from vla_eval.storage.shard import Shard
+from vla_eval.tasks.configured import read_configured
 
 pytestmark = pytest.mark.usefixtures("in_this_process", "light_workers")
 
@@ -115,6 +116,38 @@ def test_a_file_of_several_is_each_recipe_task_and_run_seed_and_flags_choose_amo
     said = capsys.readouterr().out
     assert "trainings: 8, of which 4 are described" in said
     assert said.count("run folder:") == 4
+
+
+def test_what_is_different_on_a_task_is_under_what_a_variant_changes() -> None:
+    table = AgentTable(
+        name="t",
+        policies=("imitation",),
+        tasks=("A-v0", "B-v0"),
+        train_agent={"steps": 10, "arguments": {"batch_size": 2, "exchange_share": 0.0}},
+        of_tasks={"B-v0": {"steps": 20, "arguments": {"exchange_share": 0.5}}},
+        variants={"small": {"network": {"width": 4}}, "short": {"steps": 5}},
+    )
+    assert table.of("A-v0", "small")["train_agent"] == {
+        "steps": 10,
+        "arguments": {"batch_size": 2, "exchange_share": 0.0},
+        "network": {"width": 4},
+    }
+    several = {"batch_size": 2, "exchange_share": 0.5}
+    assert table.of("B-v0", "small")["train_agent"]["arguments"] == several
+    assert table.of("B-v0", "small")["train_agent"]["steps"] == 20
+    assert table.of("B-v0", "short")["train_agent"] == {"steps": 5, "arguments": several}
+    assert table.of("C-v0", "short")["train_agent"]["steps"] == 5  # named by a flag
+
+
+def test_what_is_different_on_a_task_that_is_not_there_is_refused(tmp_path: Path) -> None:
+    file = tmp_path / "table.yaml"
+    fields = "name: t\npolicies: [ppo_base]\ntasks: [mikasa_base/T-Maze]\nof_tasks: "
+    file.write_text(fields + "{mikasa_base/T-Maze: {steps: 7}}")  # both get their version
+    table = read_configured(AgentTable, str(file), folder="configs")
+    assert table.of(table.tasks[0], None)["train_agent"] == {"steps": 7}
+    file.write_text(fields + "{mikasa_base/T-Maz-v0: {steps: 7}}")
+    with pytest.raises(UnknownNameError, match=r"of_tasks.*Did you mean 'mikasa_base/T-Maze-v0'"):
+        read_configured(AgentTable, str(file), folder="configs")
 
 
 def test_a_file_of_trainings_is_not_evaluated(capsys: pytest.CaptureFixture[str]) -> None:

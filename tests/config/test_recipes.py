@@ -162,7 +162,7 @@ class TestFinding:
         papers = ["paper_offline_small", "paper_offline_table", "paper_vla_table"]
         assert tables == ["ablations", "baselines", "memory_table", *papers]
         trainings = {name for name in list_recipes("configs") if is_agent_table(name)}
-        assert trainings == {"base_table", "ladder_base", "ladder_robots", "ladder_several"}
+        assert trainings == {"base_table", "ladder_base", "ladder_robots"}
         for name in list_recipes("configs").keys() - {*tables, *trainings}:
             loaded = load_recipe("configs", name, EvalConfig).value
             assert loaded.name == name

@@ -186,7 +186,7 @@ def _configs(args: argparse.Namespace) -> list[AgentConfig]:
     run_seeds = args.run_seeds or ([None] if table is None else table.run_seeds)
     variants: list[str | None] = [None] if table is None else [*table.variants] or [None]
     return [
-        _config(args, name, task, run_seed, start=None if table is None else table.of_variant(variant))
+        _config(args, name, task, run_seed, start=None if table is None else table.of(task, variant))
         for name in named
         for variant in variants
         for task in tasks

@@ -6,7 +6,7 @@ from typing import Any, Literal
 from vla_eval.config.environment import SimBackend, Simulator
 from vla_eval.config.files import check_run_name, recipe_fields
 from vla_eval.config.finetuning import HeldOutConfig, merge_fields
-from vla_eval.errors import RecipeError
+from vla_eval.errors import RecipeError, check_names
 from vla_eval.strict.bounds import Slots, TrainingSteps, Workers, check_bounds, check_seeds, require
 from vla_eval.strict.devices import check_device
 
@@ -79,7 +79,9 @@ class AgentTable:
     run_seeds: tuple[int, ...] = (0,)
     # as in `AgentConfig`, for each of them
     train_agent: dict[str, Any] = field(default_factory=dict)  # Any: decoded as an AgentRecipe
-    # name -> what it changes of the recipe's section, on top of `train_agent`; none: the recipes as they are
+    # task -> what is different there, on top of `train_agent`
+    of_tasks: dict[str, dict[str, Any]] = field(default_factory=dict)  # Any: likewise
+    # name -> what it changes of the recipe's section, on top of these; none: the recipes as they are
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)  # Any: likewise
     device: str = "auto"
     workers: Workers = "auto"
@@ -92,20 +94,22 @@ class AgentTable:
         for name in ("policies", "tasks", "run_seeds"):
             found = getattr(self, name)
             require(bool(found) and len(set(found)) == len(found), name, list(found), "some, none twice")
+        check_names("task", self.of_tasks, self.tasks, where="of_tasks")
         if self.variants and len(self.policies) > 1:
             raise RecipeError(
                 f"variants: expected one recipe in `policies`, whose variants they are, found "
                 f"{', '.join(self.policies)}. Give the others a file of their own."
             )
 
-    def of_variant(self, name: str | None) -> dict[str, Any]:  # Any: plain data of YAML
-        """Return what is the same in all trainings of a variant, as their configurations have it."""
-        changes = {} if name is None else self.variants[name]
+    def of(self, task: str, variant: str | None) -> dict[str, Any]:  # Any: plain data of YAML
+        """Return what trainings of a variant on a task have in common, as their configurations have it."""
+        changes = {} if variant is None else self.variants[variant]
+        section = merge_fields(self.train_agent, self.of_tasks.get(task, {}))
         same: dict[str, Any] = {
-            "train_agent": merge_fields(self.train_agent, changes),
+            "train_agent": merge_fields(section, changes),
             "device": self.device,
             "workers": self.workers,
-            **({} if name is None else {"label": name}),
+            **({} if variant is None else {"label": variant}),
         }
         return same if self.held_out is None else {**same, "held_out": asdict(self.held_out)}
 

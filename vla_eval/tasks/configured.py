@@ -23,7 +23,7 @@ def read_configured[C](
     check: Callable[[dict[str, Any]], None] = _nothing,
     where: str = "",
 ) -> C:
-    """Return a configuration whose `tasks`, if it has them, have their versions.
+    """Return a configuration whose `tasks` and `of_tasks`, if it has them, have their versions.
 
     Fingerprints and names of folders contain the tasks as they are here.
 
@@ -38,6 +38,8 @@ def read_configured[C](
         for part in (data, *(rows if isinstance(rows, list) else ())):
             if isinstance(part, dict) and isinstance(part.get("tasks"), list):  # decoding refuses the rest
                 part["tasks"] = [with_version(one) if isinstance(one, str) else one for one in part["tasks"]]
+        if isinstance(own := data.get("of_tasks"), dict):
+            data["of_tasks"] = {with_version(k) if isinstance(k, str) else k: v for k, v in own.items()}
 
     if file is not None:
         return load_recipe(folder, file, cls, edit=complete).value
