@@ -38,9 +38,9 @@ def main() -> None:
     """Read the evaluations, keep, print, draw."""
     target, *folders = sys.argv[1:]
     kept = Path(target).with_suffix(".csv")
-    scores = updated(read_scores(kept), [scores_of(Path(folder)) for folder in folders])
-    write_scores(kept, scores)
-    ends = {end: part_of(scores, is_base=end == ENDS[0]) for end in ENDS}
+    everything = updated(read_scores(kept), [scores_of(Path(folder)) for folder in folders])
+    ends = {end: part_of(everything, is_base=end == ENDS[0]) for end in ENDS}
+    write_scores(kept, everything)
     for scores in ends.values():
         print(table(scores), "\n")
     print("| memory | cores | diagnostic tasks | robot tasks | rank correlation | p |")

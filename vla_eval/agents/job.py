@@ -33,6 +33,9 @@ from vla_eval.tasks.arguments import pinned
 from vla_eval.tasks.catalog import task_spec
 from vla_eval.tasks.objects.mesh_folder import without_path
 
+ROBOTS_ALONE = {"action_noise": "arm to push", "exchange_share": "candidates that could be exchanged"}
+"""Argument of an imitation -> what a task of MIKASA-Base lacks for it."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentJob:
@@ -121,23 +124,18 @@ def agent_job(config: AgentConfig) -> AgentJob:
 def _check_imitation(recipe: AgentRecipe, reader: Reader, *, is_base: bool) -> None:
     """Refuse what no imitation can do."""
     decode(CoreSizes, recipe.network, where=NETWORK)
-    noise, exchanged = (recipe.arguments.get(name, 0) for name in ("action_noise", "exchange_share"))
     if reader.cameras:
         raise RecipeError(
             "algorithm 'imitation' reads numbers, and is given images. Robot tasks have --observation "
             "vector; networks that imitate from images are trained by `mikasa-vla finetune` "
             "(docs/sequence_policies.md)."
         )
-    if is_base and noise > 0:
-        raise RecipeError(
-            f"train_agent.arguments.action_noise is {noise:g}: tasks of MIKASA-Base have no arm to push. "
-            "Leave it out."
-        )
-    if is_base and exchanged > 0:
-        raise RecipeError(
-            f"train_agent.arguments.exchange_share is {exchanged:g}: tasks of MIKASA-Base have no candidates "
-            "that could be exchanged. Leave it out."
-        )
+    for name, missing in ROBOTS_ALONE.items():
+        if is_base and (value := recipe.arguments.get(name, 0)) > 0:
+            raise RecipeError(
+                f"train_agent.arguments.{name} is {value:g}: tasks of MIKASA-Base have no {missing}. "
+                "Leave it out."
+            )
     if recipe.reward != "dense":
         raise RecipeError(f"--reward {recipe.reward}: an imitation learns from no reward. Leave it out.")
 

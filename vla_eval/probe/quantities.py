@@ -91,7 +91,7 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
     change_of = _change_of(pairs, spec)
     by_change: dict[ChangeOf | None, Share | None] = {
         "choice": _share(pairs, lambda pair: pair.drawn.first_choice != pair.other.first_choice),
-        "set": _share(pairs, _touches_other_items),
+        "set": _share(pairs, lambda pair: given_answer(pair.drawn, spec) != given_answer(pair.other, spec)),
         "angle": _share(pairs, _turns_differently) if change_of == "angle" else None,
         "actions": moved,
         None: None,
@@ -124,11 +124,6 @@ def _change_of(pairs: Sequence[Pair], spec: TaskSpec) -> ChangeOf | None:
 
 def _share(pairs: Sequence[Pair], holds: Callable[[Pair], bool]) -> Share:
     return Share(sum(holds(pair) for pair in pairs), len(pairs))
-
-
-def _touches_other_items(pair: Pair) -> bool:
-    touched = [(r.touched_candidates or ())[: len(r.right_candidates or ())] for r in pair]
-    return set(touched[0]) != set(touched[1])
 
 
 def _turns_differently(pair: Pair) -> bool:

@@ -202,7 +202,7 @@ def changed_things(
     n_frames = len(before)
     found = [
         (frame, camera, thing)
-        for frame in range(n_frames)
+        for frame in range(n_frames if exchanges else n_before + 1)
         for camera, seen in enumerate(nothing)
         for thing in _SEEN.things_in(before[frame, camera], seen)
     ]
@@ -215,7 +215,7 @@ def changed_things(
     erased = _drawn(sorted(choices - shown), may_stay) if erases and n_frames == n_before + 1 else frozenset()
     others = colors[torch.randperm(len(colors)).numpy()] if exchanges else colors
     faces: list[tuple[int, float] | None] = [(group, 1.0) for group in groups]
-    faces += [face_of(thing, colors) if exchanges else None for _, _, thing in found[len(at_rest) :]]
+    faces += [face_of(thing, colors) for _, _, thing in found[len(at_rest) :]]
     for (frame, camera, thing), face in zip(found, faces, strict=True):
         if face is None:
             continue
