@@ -112,6 +112,24 @@ def test_training_gets_the_answers_of_acting(name: str) -> None:
     torch.testing.assert_close(answers(core.train(), tokens, at_once=N_STEPS), acting, atol=1e-5, rtol=1e-5)
 
 
+@pytest.mark.parametrize("n_first", range(1, N_STEPS))
+@pytest.mark.parametrize(("context_steps", "tokens_per_step"), [(3, 1), (5, 1), (2, 3), (1, 3)])
+def test_windows_read_at_once_leave_what_windows_read_in_turn_leave(
+    context_steps: int, tokens_per_step: int, n_first: int
+) -> None:
+    core = core_named(
+        "decision_transformer",
+        context_steps=context_steps,
+        tokens_per_step=tokens_per_step,
+        attention_dropout=0.0,
+    )
+    tokens, n_first = steps(), max(n_first - n_first % tokens_per_step, tokens_per_step)
+    acting = answers(core, tokens, at_once=tokens_per_step)
+    first, memory = core.train()(tokens[:, :n_first], core.begin(2))
+    later, _ = core(tokens[:, n_first:], memory)
+    torch.testing.assert_close(torch.cat([first, later], dim=1), acting, atol=1e-5, rtol=1e-5)
+
+
 @pytest.mark.parametrize("name", CORES)
 def test_a_step_is_answered_from_no_later_one(name: str) -> None:
     core, tokens = core_named(name), steps()

@@ -138,6 +138,29 @@ class TransformerXL(Segmented):
         first = self.anchor.new_zeros(0, self.width) if self.first_memory is None else self.first_memory
         return first.expand(n_episodes, -1, -1), cached, n_cached
 
+    def forward(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
+        """See `Core`; in training, windows of which nothing but tokens is kept are read all at once."""
+        keeps = self.options.memory_tokens or self.options.cached_tokens
+        is_begun = bool(memory[1].any())
+        if self.training and self.overlap and not keeps and not is_begun and tokens.shape[1] > self.segment:
+            return self._all_windows(tokens, memory)
+        return super().forward(tokens, memory)
+
+    def _all_windows(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
+        room, n_tokens, *kept = memory
+        n_episodes, n_new = tokens.shape[:2]
+        moves_by = self.segment - self.overlap
+        n_missing = -(n_new - self.segment) % moves_by  # no token reads a later one
+        padded = functional.pad(tokens, (0, 0, 0, n_missing))
+        windows = padded.unfold(1, self.segment, moves_by).transpose(2, 3)  # (B, windows, S, W)
+        read, _ = self.read_segment(windows.flatten(0, 1), self.begin_kept(n_episodes * windows.shape[1]))
+        of_windows = read.reshape(*windows.shape)
+        later = of_windows[:, 1:, self.overlap :].flatten(1, 2)
+        answers = torch.cat([of_windows[:, 0], later], dim=1)[:, :n_new]
+        n_left = self.overlap + (n_new - self.segment) % moves_by
+        room = torch.cat([tokens[:, n_new - n_left :].to(room.dtype), room[:, n_left:]], dim=1)
+        return answers, (room, torch.full_like(n_tokens, n_left), *kept)
+
     def read_segment(self, tokens: Tensor, kept: CoreMemory) -> tuple[Tensor, CoreMemory]:
         """See `Segmented`."""
         memory, cached, n_cached = kept
