@@ -163,6 +163,14 @@ def order(run_seed: int, pass_number: int, n: int) -> np.ndarray[Any, Any]:
     return generator(run_seed, Stream.AGENT, DEMONSTRATION, ORDER, pass_number).permutation(n)
 
 
-def exchanges(run_seed: int, step: int) -> np.random.Generator:
-    """Return what draws how candidates are exchanged at a gradient step."""
-    return generator(run_seed, Stream.AGENT, DEMONSTRATION, EXCHANGE, step)
+def exchanges(
+    run_seed: int, step: int, *, n_demonstrations: int, n_candidates: int, share: float
+) -> np.ndarray[Any, Any]:
+    """Return how candidates are exchanged at a gradient step, (demonstrations, candidates).
+
+    Candidate i of a demonstration becomes what candidate `[i]` is there; `share` of the demonstrations do so.
+    """
+    drawn = generator(run_seed, Stream.AGENT, DEMONSTRATION, EXCHANGE, step)
+    as_they_are = np.tile(np.arange(n_candidates), (n_demonstrations, 1))
+    is_exchanged = drawn.random(n_demonstrations) < share
+    return np.where(is_exchanged[:, None], drawn.permuted(as_they_are, axis=1), as_they_are)

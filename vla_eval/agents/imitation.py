@@ -164,8 +164,14 @@ class Imitation(BaseAlgorithm):
             for part in (given.inputs, given.actions, given.meant, given.is_step)
         )
         if self._exchange_share:
-            orders = torch.from_numpy(self._orders(len(chosen)))
-            inputs, meant = exchanged(inputs, meant, orders.to(self.device))
+            orders = exchanges(
+                self._expert.run_seed,
+                self.num_timesteps,
+                n_demonstrations=len(chosen),
+                n_candidates=self.policy.n_places,
+                share=self._exchange_share,
+            )
+            inputs, meant = exchanged(inputs, meant, torch.from_numpy(orders).to(self.device))
         answers, _ = self.policy(inputs, self.policy.core.begin(len(chosen)))
         errors = self.policy.errors(answers, actions, meant, meant_weight=self._meant_weight)
         loss = errors[is_step].mean()
@@ -175,14 +181,6 @@ class Imitation(BaseAlgorithm):
         self.optimizer.step()
         self._n_updates += 1
         return float(loss.detach())
-
-    def _orders(self, n: int) -> np.ndarray[Any, Any]:
-        """Return how the candidates of `n` demonstrations are exchanged at this step, (n, candidates)."""
-        n_places = self.policy.n_places
-        drawn = exchanges(self._expert.run_seed, self.num_timesteps)
-        as_they_are = np.tile(np.arange(n_places), (n, 1))
-        is_exchanged = drawn.random(n) < self._exchange_share
-        return np.where(is_exchanged[:, None], drawn.permuted(as_they_are, axis=1), as_they_are)
 
     def _chosen(self, n: int) -> np.ndarray[Any, Any]:
         """Return the demonstrations of this step: none is read twice in a pass."""

@@ -89,7 +89,7 @@ class FakeEnv:
             check_argument(int, arguments.get(name, 0), name=name, task=task.id)
         self._n_items = task.n_candidates(settings.kwargs)
         self._n_shown: int = arguments.get("n_shown", 1 if self._n_items else 0)
-        self._in_order = task.memory == "sequential"
+        self._in_order = task.order_counts
         self._touch_reach_m = MUG_REACH_M if task.id.startswith("ShellGame") else REACH_M
         self._speeds_m_s: tuple[float, float] = arguments.get("velocity_range_m_s", (0.0, 0.0))
         self._cue_after_steps: int = arguments.get("cue_after_steps", 0)

@@ -130,12 +130,11 @@ def _touches(record: EpisodeRecord) -> _Touches | None:
 
 
 def _first_mistake(episode: _Touches, spec: TaskSpec) -> _Mistake | None:
-    in_order = spec.memory == "sequential"
     for index, touched in enumerate(episode.touched):
         earlier = episode.touched[:index]
-        due = [episode.right[index]] if in_order else [i for i in episode.right if i not in earlier]
+        due = [episode.right[index]] if spec.order_counts else [i for i in episode.right if i not in earlier]
         if touched in episode.right:
-            if in_order and touched != due[0]:
+            if spec.order_counts and touched != due[0]:
                 return _Mistake("order", None)
             continue
         if spec.cue_marks_place:

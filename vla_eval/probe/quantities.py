@@ -80,7 +80,7 @@ def given_answer(record: EpisodeRecord, spec: TaskSpec) -> Answer:
 
 
 def _as_answer(candidates: Sequence[int], spec: TaskSpec) -> Answer:
-    return tuple(candidates) if spec.memory == "sequential" else frozenset(candidates)
+    return tuple(candidates) if spec.order_counts else frozenset(candidates)
 
 
 def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | None:
@@ -111,7 +111,7 @@ def swap_quantities(pairs: Sequence[Pair], spec: TaskSpec) -> SwapQuantities | N
 
 def _change_of(pairs: Sequence[Pair], spec: TaskSpec) -> ChangeOf | None:
     """Return what a change is counted by, as far as the records know it."""
-    is_determined = pairs[0].drawn.target is not None or spec.memory == "sequential"
+    is_determined = pairs[0].drawn.target is not None or spec.order_counts
     if pairs[0].drawn.n_candidates and is_determined:
         return "choice"
     records = [record for pair in pairs for record in pair]

@@ -100,6 +100,11 @@ class TaskSpec:
         return self.id if "/" in self.id else f"vla_eval/{self.id}"
 
     @property
+    def order_counts(self) -> bool:
+        """Whether the right candidates have to be touched in the order in which they were shown."""
+        return self.memory == "sequential"
+
+    @property
     def maniskill_id(self) -> str:
         """The id of the ManiSkill environment behind it: batched, torch."""
         namespace, _, name = self.gym_id.partition("/")
