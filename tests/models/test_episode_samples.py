@@ -25,12 +25,14 @@ def _seeded() -> Iterator[None]:
         yield
 
 
-def config(*, window_steps: int = N_STEPS, **fields: object) -> MikasaSequenceConfig:
+def config(
+    *, window_steps: int = N_STEPS, waiting_share: float = 1.0, **fields: object
+) -> MikasaSequenceConfig:
     image = PolicyFeature(type=FeatureType.VISUAL, shape=(3, EDGE_PX, EDGE_PX))
     return MikasaSequenceConfig(
         device="cpu",
         window_steps=window_steps,
-        waiting_share=1.0,
+        waiting_share=waiting_share,
         input_features={
             **dict.fromkeys(CAMERAS, image),
             STATE_KEY: PolicyFeature(type=FeatureType.STATE, shape=(10,)),
@@ -312,6 +314,25 @@ class TestGoals:
         assert kept[1.0] == {tuple(range(8))}
         assert kept[1e-9] == {(0, 3, 4, 6, 7)}  # 3 waits; the last one is the frame that was sampled
         assert len(kept[0.5]) > 2 and all({0, 3, 4, 6, 7} <= {*steps} for steps in kept[0.5])
+
+    @pytest.mark.parametrize(("share", "run_steps"), [(0.2, 5), (0.25, 4), (1 / 3, 3), (1.0, 1)])
+    def test_waiting_that_is_used_evenly_misses_no_cue_as_long_as_its_distance(
+        self, share: float, run_steps: int
+    ) -> None:
+        sizes = (1, *(0,) * 13, 0.6, 1.2, *(0,) * 13)
+        given = self.given(sizes, n_real=len(sizes))
+        made = config(window_steps=len(sizes), waiting_share=share, waits_evenly=True)
+        # An action that differs from the one before is no waiting; nor is the frame that was sampled.
+        waits = [*range(2, 14), *range(17, len(sizes) - 1)]
+        found = set()
+        for _ in range(20):
+            episodes = episodes_of(given, made, training=True, each_motion=True)
+            for steps, counts in zip(episodes.steps, episodes.counts, strict=True):
+                used = {*steps[counts[:, 0] > 0].tolist()}
+                runs = [waits[first : first + run_steps] for first in range(len(waits) - run_steps + 1)]
+                assert [len(used & {*run}) for run in runs] == [1] * len(runs)
+                found.add(tuple(sorted(used)))
+        assert len(found) == run_steps
 
 
 @pytest.mark.parametrize("mode", CONTROL_MODES)

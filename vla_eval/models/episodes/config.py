@@ -57,6 +57,9 @@ class EpisodeConfig(PortedConfig):
     change_weight: float = 3.0
     # a step whose action is that of the step before is used with this probability
     waiting_share: float = 0.3
+    # of such steps one in each 1 / `waiting_share` is used, from a random one on, instead of each by itself:
+    # so that a cue as long as this, while the arm waits, is always seen
+    waits_evenly: bool = False
     # any other step that is not a decision, with this one: for a training of choices, most of whose frames
     # would be of motions between them. The first step is always used.
     moving_share: float = 1.0

@@ -211,7 +211,10 @@ def _waiting_beyond(actions: Tensor, before: Tensor) -> Tensor:
 
 def _kept(waits: Tensor, begins: Tensor, real: Tensor, config: EpisodeConfig) -> Tensor:
     """Return (B, T): the steps that are trained on, drawn by torch's generator."""
-    left_out = waits & (torch.rand(waits.shape, device=waits.device) > config.waiting_share)
+    if config.waits_evenly:
+        left_out = waits & ~_evenly(waits, config.waiting_share)
+    else:
+        left_out = waits & (torch.rand(waits.shape, device=waits.device) > config.waiting_share)
     if config.moving_share < 1:
         begun = torch.zeros_like(real)
         begun[:, 1:] = real[:, :-1]  # all steps but the first one
@@ -220,6 +223,13 @@ def _kept(waits: Tensor, begins: Tensor, real: Tensor, config: EpisodeConfig) ->
     left_out[:, -1] = False  # the frame that was sampled
     kept = real & ~left_out
     return kept & _until_a_decision(begins, config.decision_share) if config.decision_share else kept
+
+
+def _evenly(among: Tensor, share: float) -> Tensor:
+    """Return (B, T): of the steps `among` (B, T) one in each 1 / `share`, from a random one on."""
+    offsets = torch.rand(len(among), 1, dtype=torch.float64, device=among.device)
+    reached = (among.cumsum(dim=1) * share + offsets).floor()
+    return among & (reached.diff(dim=1, prepend=torch.zeros_like(offsets)) > 0)
 
 
 def _shares(config: EpisodeConfig, actions: Tensor) -> Tensor:
