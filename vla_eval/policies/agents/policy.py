@@ -13,7 +13,7 @@ from vla_eval.core import ActionChunk, EpisodeStart, MemoryArrays, ObservationWi
 from vla_eval.errors import SpecMismatchError
 from vla_eval.policies.agents.imitator import CoreNetwork
 from vla_eval.policies.agents.network import AgentNetwork, load_network, read_about
-from vla_eval.policies.agents.observing import action_space, as_action, reader_of
+from vla_eval.policies.agents.observing import Seen, action_space, as_action, reader_of
 from vla_eval.policies.context import PolicyContext
 from vla_eval.specs import PolicySpec
 
@@ -69,8 +69,11 @@ class AgentPolicy:
 
     def act(self, window: ObservationWindow) -> ActionChunk:
         """Return the action for the last observation."""
-        memory, is_first = self._memory[window.slot], self._memory[window.slot] is None
-        seen = self._read(window.last)
+        return self.act_on(self._read(window.last), slot=window.slot)
+
+    def act_on(self, seen: Seen, *, slot: int) -> ActionChunk:
+        """Return the action for what the network is given, by name; see `given_space`."""
+        memory, is_first = self._memory[slot], self._memory[slot] is None
         self._check_shapes({name: values.shape for name, values in seen.items()})
         chosen, remembered = self._network.predict(
             {name: values[None] for name, values in seen.items()},
@@ -78,7 +81,7 @@ class AgentPolicy:
             episode_start=np.array([is_first]),
             deterministic=True,
         )
-        self._memory[window.slot] = remembered
+        self._memory[slot] = remembered
         return ActionChunk(actions=as_action(self._action, chosen[0])[None])
 
     def _check_shapes(self, found: dict[str, tuple[int, ...]]) -> None:
