@@ -188,7 +188,9 @@ def frames_of(task: str, *, run_seed: int, n: int) -> Frames:
             for slot in range(N_SLOTS)
         ]
         seen = _Seen()
-        rollout(env, expert, starts, RolloutSettings(chunking=ONE_BY_ONE, stop_at_success=True), [seen])
+        rollout(
+            env, expert, starts, RolloutSettings(chunking=ONE_BY_ONE, stop_at_success=True), observers=[seen]
+        )
         rows += [_row(result.observation) for result in seen.results]
         print(f"{begin + N_SLOTS - first} of {n} episodes, {len(rows)} frames", flush=True)
     columns = [np.stack(column) for column in zip(*rows, strict=True)]
