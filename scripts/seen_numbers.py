@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from vla_eval.config.agents import TRAINING_SEEDS
-from vla_eval.config.environment import EnvSettings
+from vla_eval.config.environment import EnvSettings, Simulator
 from vla_eval.config.prompts import instruction_for
 from vla_eval.core import (
     ActionChunk,
@@ -165,9 +165,11 @@ class _Seen(StepObserver):
             self.results.append(result)
 
 
-def frames_of(task: str, *, run_seed: int, n: int) -> Frames:
+def frames_of(task: str, *, run_seed: int, n: int, simulator: Simulator = "maniskill") -> Frames:
     """Let the scripted expert act in about `n` episodes, on seeds of trainings, and return what is seen."""
-    settings = EnvSettings(task=task, cameras=(CAMERA,), privileged=True, n_slots=N_SLOTS)
+    settings = EnvSettings(
+        task=task, simulator=simulator, cameras=(CAMERA,), privileged=True, n_slots=N_SLOTS
+    )
     env, spec = make_env(settings), task_spec(task)
     context = PolicyContext(
         name="oracle", env=env.spec, chunking=ONE_BY_ONE, n_candidates=spec.n_candidates({}), n_slots=N_SLOTS
@@ -232,6 +234,12 @@ def train(frames: Frames, *, steps: int, run_seed: int) -> Iterator[tuple[int, S
         network.train()
 
 
+def surest(found: FloatArray, points_m: FloatArray, likely: FloatArray) -> FloatArray:
+    """Return (n, 3), where on the table and how sure: as found before, or as now if that is surer."""
+    surer = likely > found[:, 2]
+    return np.where(surer[:, None], np.column_stack([points_m, likely]), found)
+
+
 def save(folder: Path, network: Sight, *, task: str, height_m: float) -> None:
     """Write what `make` reads."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -291,8 +299,7 @@ class SeeingAgent:
         if is_due:
             pixels, likely = found_pixels(cells)
             points_m = points_of(pixels[0], self._height_m)
-            surer = likely[0] > found[:, 2]
-            found[surer] = np.column_stack([points_m[:, :2], likely[0]])[surer]
+            found = self._found[window.slot] = surest(found, points_m[:, :2], likely[0])
             on_table = np.column_stack([found[:, :2], np.full(self._n, self._height_m)])
             places_m = on_table - seen.state["tcp_pose"][:3]
         own = [seen.state[name] for name in sorted(seen.state)]
