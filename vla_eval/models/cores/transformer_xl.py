@@ -141,8 +141,8 @@ class TransformerXL(Segmented):
     def forward(self, tokens: Tensor, memory: CoreMemory) -> tuple[Tensor, CoreMemory]:
         """See `Core`; in training, windows of which nothing but tokens is kept are read all at once."""
         keeps = self.options.memory_tokens or self.options.cached_tokens
-        is_begun = bool(memory[1].any())
-        if self.training and self.overlap and not keeps and not is_begun and tokens.shape[1] > self.segment:
+        may = self.training and self.overlap and not keeps and tokens.shape[1] > self.segment
+        if may and not bool(memory[1].any()):  # looked at last: a GPU would be waited for in acting, too
             return self._all_windows(tokens, memory)
         return super().forward(tokens, memory)
 
