@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 from torch.nn import functional
@@ -46,7 +47,7 @@ from vla_eval.policies.registry import make_from_adapter
 from vla_eval.rollout import RolloutSettings, rollout
 from vla_eval.task_state import PrivilegedState
 from vla_eval.tasks.catalog import task_spec
-from vla_eval.tasks.interface import BASE_CAMERA_M, CAMERA_FOV_RAD, IMAGE_SIZE_PX
+from vla_eval.tasks.interface import CAMERA_FOV_RAD, IMAGE_SIZE_PX, base_camera_axes
 
 CAMERA = "base_camera"
 CELL_PX, N_CELLS = 2, IMAGE_SIZE_PX // 2
@@ -60,34 +61,26 @@ class Frames:
     """N frames of a task's base camera, and what is in view."""
 
     images: ImageArray  # (N, H, W, 3) uint8
-    shown: FloatArray  # (N,) the candidate that the cue shows; -1: none
-    are_due: FloatArray  # (N,) whether the candidates are in view
+    shown: NDArray[np.int64]  # (N,) the candidate that the cue shows; -1: none
+    are_due: NDArray[np.bool_]  # (N,) whether the candidates are in view
     places_m: FloatArray  # (N, candidates, 3) world frame
-
-
-def camera_axes() -> tuple[FloatArray, FloatArray]:
-    """Return where the base camera is (3,), and what is forward, left and up in its image (3, 3)."""
-    eye, target = (np.array(point) for point in BASE_CAMERA_M)
-    forward = (target - eye) / np.linalg.norm(target - eye)
-    left = np.cross([0, 0, 1], forward)
-    left /= np.linalg.norm(left)
-    return eye, np.stack([forward, left, np.cross(forward, left)])
 
 
 def pixels_of(points_m: FloatArray) -> FloatArray:
     """Return (..., 2), column and row in px, of points (..., 3) in the world frame."""
-    eye, axes = camera_axes()
+    eye, axes = base_camera_axes()
     seen = (points_m - eye) @ axes.T
     half_px = IMAGE_SIZE_PX / 2
-    pixels: FloatArray = half_px - half_px / np.tan(CAMERA_FOV_RAD / 2) * seen[..., 1:] / seen[..., :1]
+    right_and_down = seen[..., 1:] * (1, -1)
+    pixels: FloatArray = half_px + half_px / np.tan(CAMERA_FOV_RAD / 2) * right_and_down / seen[..., :1]
     return pixels
 
 
 def points_of(pixels: FloatArray, height_m: float) -> FloatArray:
     """Return the points (..., 3) at a height that are seen at pixels (..., 2)."""
-    eye, axes = camera_axes()
+    eye, axes = base_camera_axes()
     half_px = IMAGE_SIZE_PX / 2
-    aside = (half_px - pixels) * np.tan(CAMERA_FOV_RAD / 2) / half_px
+    aside = (pixels - half_px) * (1, -1) * np.tan(CAMERA_FOV_RAD / 2) / half_px
     rays = axes[0] + aside @ axes[1:]
     points: FloatArray = eye + (height_m - eye[2]) / rays[..., 2:] * rays
     return points
@@ -132,10 +125,11 @@ def shares_of_cells(pixels: Tensor) -> Tensor:
 
 def found_pixels(cells: Tensor) -> tuple[FloatArray, FloatArray]:
     """Return where each candidate is, (N, n, 2) in px, and how likely its likeliest cell is, (N, n)."""
-    likely, best = cells.softmax(dim=-1).max(dim=-1)
+    shares = cells.softmax(dim=-1)
+    likely, best = shares.max(dim=-1)
     line = torch.arange(N_CELLS)
     rows, columns = best // N_CELLS, best % N_CELLS
-    maps = cells.softmax(dim=-1).unflatten(-1, (N_CELLS, N_CELLS))
+    maps = shares.unflatten(-1, (N_CELLS, N_CELLS))
     near_row = ((line - rows[..., None]).abs() <= ROUND).float()
     near_column = ((line - columns[..., None]).abs() <= ROUND).float()
     around = maps * near_row[..., :, None] * near_column[..., None, :]
@@ -199,12 +193,12 @@ def frames_of(task: str, *, run_seed: int, n: int, simulator: Simulator = "manis
     return Frames(images=columns[0], shown=columns[1], are_due=columns[2], places_m=columns[3])
 
 
-def _row(seen: Observation) -> tuple[ImageArray, FloatArray, FloatArray, FloatArray]:
+def _row(seen: Observation) -> tuple[ImageArray, int, bool, FloatArray]:
     world = seen.privileged
     assert isinstance(world, PrivilegedState)
     shown = world.shown_candidates[0] if world.shown_candidates else -1
     is_due = world.phase == "response"
-    return seen.images[CAMERA], np.array(shown), np.array(is_due), world.candidate_positions_m.copy()
+    return seen.images[CAMERA], shown, is_due, world.candidate_positions_m.copy()
 
 
 def train(frames: Frames, *, steps: int, run_seed: int) -> Iterator[tuple[int, Sight, float]]:
@@ -292,14 +286,15 @@ class SeeingAgent:
         seen = window.last
         with torch.inference_mode():
             cue, due, cells = self._network(torch.from_numpy(seen.images[CAMERA].copy())[None])
-        found, is_due = self._found[window.slot], bool(due[0] > 0)
+        is_due = bool(due[0] > 0)
         shown = np.zeros(self._n + 1)
         shown[int(cue[0].argmax())] = 1
         places_m = np.zeros((self._n, 3))
         if is_due:
             pixels, likely = found_pixels(cells)
             points_m = points_of(pixels[0], self._height_m)
-            found = self._found[window.slot] = surest(found, points_m[:, :2], likely[0])
+            found = surest(self._found[window.slot], points_m[:, :2], likely[0])
+            self._found[window.slot] = found
             on_table = np.column_stack([found[:, :2], np.full(self._n, self._height_m)])
             places_m = on_table - seen.state["tcp_pose"][:3]
         own = [seen.state[name] for name in sorted(seen.state)]

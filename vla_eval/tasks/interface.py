@@ -6,6 +6,7 @@ Knows nothing of simulators: a server of policies has none.
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from vla_eval.control_modes import CONTROL_MODE, EE_DELTA_POSE, action_spec
 from vla_eval.errors import TaskArgumentError
@@ -45,6 +46,16 @@ def step_range(name: str, value: object) -> tuple[int, int]:
             "(least, most) of them."
         )
     return int(pair[0]), int(pair[1])
+
+
+def base_camera_axes() -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return where the base camera is, (3,) in m, and its axes ahead, right and up, (3, 3); world frame."""
+    eye, target = (np.array(point) for point in BASE_CAMERA_M)
+    ahead = target - eye
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    return eye, np.stack([ahead, right, np.cross(right, ahead)])
 
 
 def cameras(size_px: int = IMAGE_SIZE_PX) -> tuple[CameraSpec, ...]:

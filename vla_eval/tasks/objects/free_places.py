@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vla_eval.robots.arm import Xyz
-from vla_eval.tasks.interface import BASE_CAMERA_M, CAMERA_FOV_RAD
+from vla_eval.tasks.interface import BASE_CAMERA_M, CAMERA_FOV_RAD, base_camera_axes
 from vla_eval.tasks.objects.item_names import THING_NAMES
 from vla_eval.tasks.objects.layout import (
     DISC_Y_M,
@@ -148,14 +148,10 @@ def free_places_m(areas: tuple[Area, ...], *, base_m: Xyz) -> Plane:
 
 def _seen(points_m: Plane) -> Any:  # (…) bool
     """Return (…) whether points on the table are in the base camera's image, not at its very edge."""
-    eye, target = map(np.array, BASE_CAMERA_M)
-    ahead = target - eye
-    ahead /= np.linalg.norm(ahead)
-    right = np.cross(ahead, (0.0, 0.0, 1.0))
-    right /= np.linalg.norm(right)
+    eye, (ahead, right, up) = base_camera_axes()
     ways = np.concatenate((points_m, np.zeros((*points_m.shape[:-1], 1))), axis=-1) - eye
     edge = ways @ ahead * math.tan(CAMERA_FOV_RAD / 2) * SEEN_SHARE
-    return (np.abs(ways @ right) <= edge) & (np.abs(ways @ np.cross(right, ahead)) <= edge)
+    return (np.abs(ways @ right) <= edge) & (np.abs(ways @ up) <= edge)
 
 
 def free_things(candidates: Collection[str]) -> tuple[str, ...]:
